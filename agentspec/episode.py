@@ -1,0 +1,326 @@
+"""One episode, and many at once.
+
+Episodes are asyncio tasks on one loop; each owns its agent, its recorder and a worker thread in which its environment
+runs under a time limit. Nothing is shared, so results do not depend on how many run at once. An environment that
+crashes, hangs or pays NaN makes its own episode ``failed`` and touches no other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from agentspec.agent import Agent
+from agentspec.llm.base import LLM, ContextOverflowError, LLMError
+from agentspec.llm.pricing import Prices
+from agentspec.llm.recorder import Recorder, derive_seed
+from agentspec.protocols import Embedder
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.spec import AgentSpec
+from agentspec.trajectory import Trajectory, jsonable, versions
+from agentspec.types import Task, Transition
+
+T = TypeVar("T")
+MakeEnv = Callable[[Task], Any]
+
+OBJECTS_IN_INFO = ("instruction", "action_schema", "state", "metrics")
+"""Entries of ``info`` that a transition does not repeat: they stand in the agent's input or in the metrics."""
+
+
+class EnvironmentFailure(RuntimeError):
+    """An environment crashed, hung or returned what no reward can be computed from."""
+
+
+def environment_id(name: str) -> str:
+    """The gymnasium id of a registered short name (ids pass through)."""
+    import gymnasium
+
+    import agentspec.envs  # noqa: F401  (registers our environments)
+
+    if name in gymnasium.registry:
+        return name
+    return REGISTRY.get("env", name).target
+
+
+def make_env(task: Task) -> Any:
+    """The environment of ``task`` through ``gymnasium.make``.
+
+    Raises:
+        SpecError: an unknown environment, with the nearest names, or options it does not take.
+    """
+    import gymnasium
+
+    name = environment_id(task.env)
+    try:
+        return gymnasium.make(name, disable_env_checker=True, **task.options)
+    except TypeError as error:
+        raise SpecError(f"{name} refused its options {dict(task.options)}: {error}") from error
+
+
+class EnvWorker:
+    """A daemon thread that runs one environment's calls in order, each under a time limit.
+
+    A call that exceeds the limit cannot be killed; the worker is then abandoned with its thread.
+    """
+
+    def __init__(self, timeout: float | None) -> None:
+        self.timeout = timeout
+        self._jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        threading.Thread(target=self._run, daemon=True, name="agentspec-env").start()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            function, future, loop = job
+            try:
+                result, error = function(), None
+            except BaseException as caught:
+                result, error = None, caught
+            try:
+                loop.call_soon_threadsafe(_resolve, future, result, error)
+            except RuntimeError:
+                return  # the loop is closed: nobody waits any more
+
+    async def call(self, what: str, function: Callable[[], T]) -> T:
+        """Run ``function`` in the worker.
+
+        Raises:
+            EnvironmentFailure: it raised, or took longer than the time limit (seconds).
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[T] = loop.create_future()
+        self._jobs.put((function, future, loop))
+        try:
+            return await asyncio.wait_for(future, self.timeout)
+        except TimeoutError:
+            raise EnvironmentFailure(f"{what} took longer than {self.timeout} s") from None
+        except SpecError:
+            raise
+        except Exception as error:
+            raise EnvironmentFailure(f"{what} raised {type(error).__name__}: {error}") from error
+
+    def close(self) -> None:
+        """Let the thread end after what it is doing."""
+        self._jobs.put(None)
+
+
+def _resolve(future: asyncio.Future[Any], result: Any, error: BaseException | None) -> None:
+    if future.done():
+        return
+    if error is None:
+        future.set_result(result)
+    else:
+        future.set_exception(error)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to run: which task, which of its rollouts, and the seed of the run it belongs to."""
+
+    task: Task
+    rollout: int = 0
+    run_seed: int = 0
+    memory_state: bytes | None = None
+
+    @property
+    def seed(self) -> int:
+        """Seed of everything the agent draws in this episode."""
+        return derive_seed(self.run_seed, self.task.key, self.rollout)
+
+
+@dataclass
+class Runner:
+    """Runs episodes of one spec against one backend.
+
+    Args:
+        spec: the agent.
+        llm: the backend; ``None`` only for specs whose modules call no model.
+        make_env: task -> environment.
+        concurrency: most episodes at once (``None``: all).
+        timeout_s: limit of every environment call, in seconds (``None``: none).
+        max_steps: most steps of an episode, on top of the environment's own limit.
+        policy: label of the policy, for tables.
+    """
+
+    spec: AgentSpec
+    llm: LLM | None = None
+    make_env: MakeEnv = make_env
+    concurrency: int | None = None
+    timeout_s: float | None = 60.0
+    max_steps: int | None = None
+    prices: Prices = field(default_factory=Prices)
+    embedder: Embedder | None = None
+    policy: str = ""
+    on_done: Callable[[Trajectory], None] | None = None
+
+    def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
+        """Run all jobs; trajectories come back in the order of the jobs."""
+        return asyncio.run(self.run_async(jobs))
+
+    async def run_async(self, jobs: Sequence[Job]) -> list[Trajectory]:
+        """As :meth:`run`, inside a running loop."""
+        llm = self.llm or NoLLM()
+        self.spec.check(frozenset(llm.capabilities) | {"snapshots"}, f"backend {llm.name!r}")
+        gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
+
+        async def guarded(job: Job) -> Trajectory:
+            async with gate:
+                trajectory = await self._episode(job, llm)
+            if self.on_done:
+                self.on_done(trajectory)
+            return trajectory
+
+        return list(await asyncio.gather(*(guarded(job) for job in jobs)))
+
+    async def _episode(self, job: Job, llm: LLM) -> Trajectory:
+        name = f"{job.task.key}-{job.rollout}-{job.seed:x}"
+        recorder = Recorder(
+            llm,
+            episode=name,
+            seed=job.seed,
+            sampling=self.spec.sampling,
+            budget=self.spec.budget,
+            prices=self.prices,
+        )
+        agent = self.spec.build(recorder, embedder=self.embedder)
+        worker = EnvWorker(self.timeout_s)
+        llm.enter(name)
+        try:
+            return await self._play(job, agent, worker)
+        finally:
+            llm.leave(name)
+            worker.close()
+
+    async def _play(self, job: Job, agent: Agent, worker: EnvWorker) -> Trajectory:
+        if self.spec.scope == "run" and job.memory_state is not None:
+            agent.memory.restore(job.memory_state)
+        transitions: list[Transition] = []
+        info: dict[str, Any] = {}
+        status, error, ended = "completed", "", "environment"
+        env = None
+        try:
+            env = await worker.call("make", lambda: self.make_env(job.task))
+            observation, info = await worker.call("reset", lambda: env.reset(seed=job.task.seed))
+            agent.begin_episode(job.task)
+            while not (transitions and (transitions[-1].terminated or transitions[-1].truncated)):
+                if self.max_steps is not None and len(transitions) >= self.max_steps:
+                    ended = "max_steps"
+                    break
+                transition, observation, info = await _step(job.task, agent, env, worker, observation, info)
+                if transition is None:
+                    ended = "budget"
+                    break
+                transitions.append(transition)
+                await agent.learn(transition)
+        except ContextOverflowError as caught:
+            ended, error = "context", str(caught)
+        except (EnvironmentFailure, LLMError) as caught:
+            status, error, ended = "failed", str(caught), "failure"
+        finally:
+            if env is not None and status == "completed":
+                await worker.call("close", env.close)
+        metrics = {**jsonable(info.get("metrics", {})), **_scaffold_metrics(transitions, agent.recorder, ended)}
+        trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
+        if status == "completed":
+            before = len(agent.recorder.calls)
+            await agent.end_episode(trajectory)
+            if len(agent.recorder.calls) > before:
+                metrics |= _scaffold_metrics(transitions, agent.recorder, ended)
+                trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
+        return trajectory
+
+    def _trajectory(
+        self,
+        job: Job,
+        transitions: Sequence[Transition],
+        agent: Agent,
+        metrics: dict[str, Any],
+        status: str,
+        error: str,
+    ) -> Trajectory:
+        return Trajectory(
+            task=job.task,
+            spec=self.spec.to_data(),
+            rollout=job.rollout,
+            seed=job.seed,
+            policy=self.policy,
+            transitions=tuple(transitions),
+            calls=tuple(sorted(agent.recorder.calls, key=lambda c: c.id)),
+            metrics=metrics,
+            status=status,
+            error=error,
+            versions=versions(),
+            memory_state=agent.memory.snapshot() if self.spec.scope == "run" else None,
+        )
+
+
+async def _step(
+    task: Task, agent: Agent, env: Any, worker: EnvWorker, observation: Any, info: dict[str, Any]
+) -> tuple[Transition | None, Any, dict[str, Any]]:
+    """Decide and act once; no transition when the budget is exhausted."""
+    agent_input, decision = await agent.decide(task, observation, info)
+    if "budget" in decision.trace:
+        return None, observation, info
+    text = decision.action.text
+    observation, reward, terminated, truncated, info = await worker.call("step", lambda: env.step(text))
+    if not math.isfinite(float(reward)):
+        raise EnvironmentFailure(f"step returned reward {reward} for action {text!r}; rewards must be finite")
+    transition = Transition(
+        step=agent.clock.step,
+        input=agent_input,
+        decision=decision,
+        action_text=text,
+        reward=float(reward),
+        next_text=observation["text"],
+        terminated=bool(terminated),
+        truncated=bool(truncated),
+        info={k: jsonable(v) for k, v in info.items() if k not in OBJECTS_IN_INFO},
+    )
+    return transition, observation, info
+
+
+def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, ended: str) -> dict[str, Any]:
+    """What the scaffold adds to the environment's figures; ``thinking_s`` is wall-clock time of the model calls."""
+    usage, steps = recorder.usage, len(transitions)
+    return {
+        "steps": steps,
+        "return": sum(t.reward for t in transitions),
+        "invalid_actions": sum(bool(t.info.get("invalid")) or not t.decision.valid for t in transitions),
+        "llm_calls": len(recorder.calls),
+        "input_tokens": usage.input_tokens,
+        "output_tokens": usage.output_tokens,
+        "cached_tokens": usage.cached_tokens,
+        "cost": usage.cost,
+        "thinking_s": sum(c.latency_s for c in recorder.calls),
+        "ended": ended,
+    }
+
+
+class NoLLM:
+    """The backend of agents without a model: any call is an error that says so."""
+
+    name = "none"
+    capabilities: frozenset[str] = frozenset()
+    max_context = 0
+
+    async def generate(self, request: Any) -> Any:
+        raise LLMError(f"{request.tag.path} asked for a model, but none was configured; name one with `--model`")
+
+    async def score(self, messages: Any, continuations: Any) -> Any:
+        raise LLMError("a module asked for scores, but no model was configured; name one with `--model`")
+
+    def count_tokens(self, text: str) -> int:
+        return len(text) // 4 + 1
+
+    def enter(self, episode: str) -> None:
+        return None
+
+    def leave(self, episode: str) -> None:
+        return None
+
+
+__all__ = ["EnvWorker", "EnvironmentFailure", "Job", "NoLLM", "Runner", "environment_id", "make_env"]

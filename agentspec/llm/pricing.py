@@ -1,0 +1,49 @@
+"""Dollars per token. Prices change: a run records the table it used, and a YAML file can replace it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from agentspec.types import Usage
+
+
+@dataclass(frozen=True)
+class Price:
+    """Dollars per million input, cached-input and output tokens."""
+
+    input: float = 0.0
+    output: float = 0.0
+    cached: float | None = None
+
+
+@dataclass(frozen=True)
+class Prices:
+    """Price by model name; the longest name that is a prefix of the model's counts. Unknown (local) models cost 0."""
+
+    table: Mapping[str, Price] = field(default_factory=dict)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Prices:
+        """Read ``{model: {input: $/M, output: $/M, cached: $/M}}``.
+
+        Raises:
+            ValueError: the file is not such a mapping.
+        """
+        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
+            raise ValueError(f"{path}: expected a mapping of model name to {{input, output, cached}} in $ per million")
+        return cls({str(name): Price(**value) for name, value in data.items()})
+
+    def cost(self, model: str, usage: Usage) -> float:
+        """Dollars of ``usage`` by ``model``."""
+        names = [n for n in self.table if model.startswith(n)]
+        if not names:
+            return 0.0
+        price = self.table[max(names, key=len)]
+        cached = price.input if price.cached is None else price.cached
+        fresh = usage.input_tokens - usage.cached_tokens
+        return (fresh * price.input + usage.cached_tokens * cached + usage.output_tokens * price.output) / 1e6

@@ -1,0 +1,153 @@
+"""The metered view of a backend that one episode's modules see.
+
+A :class:`Recorder` belongs to one episode. It numbers and seeds every call, stamps who asked, keeps the
+:class:`~agentspec.types.LLMCall` records that training and cost accounting read, and enforces a :class:`Budget`.
+Modules never hold a backend, only a :class:`ModuleLLM`: the recorder bound to the module's name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from agentspec.llm.base import LLM, LLMError, Message, Request
+from agentspec.llm.pricing import Prices
+from agentspec.types import CallTag, Credit, LLMCall, Sampling, Usage
+
+
+class BudgetExceededError(LLMError):
+    """The episode has used up its calls, tokens or dollars."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Upper bounds for one episode; ``None`` is unlimited. ``cost`` in dollars, ``tokens`` are input plus output."""
+
+    calls: int | None = None
+    tokens: int | None = None
+    cost: float | None = None
+
+    def check(self, calls: int, tokens: int, cost: float) -> None:
+        """Raise :class:`BudgetExceededError` if one more call may not be made."""
+        for name, limit, used in (
+            ("calls", self.calls, calls),
+            ("tokens", self.tokens, tokens),
+            ("cost", self.cost, cost),
+        ):
+            if limit is not None and used >= limit:
+                raise BudgetExceededError(
+                    f"the budget of {limit} {name} per episode is used up (used {used}); raise `budget.{name}` "
+                    "in the spec or choose a cheaper method"
+                )
+
+
+def derive_seed(*parts: object) -> int:
+    """A 63-bit seed that depends on every part and on nothing else (stable across processes)."""
+    text = "\x1f".join(str(p) for p in parts)
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+class Recorder:
+    """All model calls of one episode.
+
+    Args:
+        llm: the backend.
+        episode: id of the episode, also the key under which the backend may cache its context.
+        seed: every call's seed derives from it and the call's number.
+        sampling: defaults of every call; modules override what their method fixes.
+        budget: upper bounds for the episode.
+        prices: dollars per token, by model name.
+    """
+
+    def __init__(
+        self,
+        llm: LLM,
+        *,
+        episode: str,
+        seed: int,
+        sampling: Sampling | None = None,
+        budget: Budget | None = None,
+        prices: Prices | None = None,
+    ) -> None:
+        self.llm = llm
+        self.episode = episode
+        self.seed = seed
+        self.sampling = sampling or Sampling()
+        self.budget = budget or Budget()
+        self.prices = prices or Prices()
+        self.calls: list[LLMCall] = []
+        self.step = 0
+        self._next_id = 0
+        self._tokens = 0
+        self._cost = 0.0
+
+    async def generate(self, module: str, purpose: str, messages: Sequence[Message], **overrides: Any) -> LLMCall:
+        """Ask the model; the record is kept. ``overrides`` are fields of :class:`~agentspec.types.Sampling`.
+
+        Raises:
+            BudgetExceededError: before the call, if the budget is used up.
+        """
+        branch = str(overrides.pop("branch", ""))
+        # Concurrent calls of one episode each count from the moment they are made, not when they return.
+        self.budget.check(self._next_id, self._tokens, self._cost)
+        call_id, self._next_id = self._next_id, self._next_id + 1
+        request = Request(
+            messages=tuple(messages),
+            sampling=replace(self.sampling, **overrides),
+            tag=CallTag(module, purpose, self.episode, self.step, branch),
+            seed=derive_seed(self.seed, call_id),
+            id=call_id,
+        )
+        call = await self.llm.generate(request)
+        usage = replace(call.usage, cost=self.prices.cost(call.model or self.llm.name, call.usage))
+        call = replace(call, usage=usage)
+        self._tokens += usage.input_tokens + usage.output_tokens
+        self._cost += usage.cost
+        self.calls.append(call)
+        return call
+
+    def credit(self, call_id: int, completion: int, credit: Credit) -> None:
+        """Say what one completion of one call was for.
+
+        Raises:
+            KeyError: no such call in this episode.
+        """
+        for i, call in enumerate(self.calls):
+            if call.id == call_id:
+                completions = list(call.completions)
+                completions[completion] = replace(completions[completion], credit=credit)
+                self.calls[i] = replace(call, completions=tuple(completions))
+                return
+        raise KeyError(f"call {call_id} was not made in episode {self.episode}; made: {[c.id for c in self.calls]}")
+
+    @property
+    def usage(self) -> Usage:
+        """Totals of the episode so far."""
+        return Usage(
+            input_tokens=sum(c.usage.input_tokens for c in self.calls),
+            output_tokens=sum(c.usage.output_tokens for c in self.calls),
+            cached_tokens=sum(c.usage.cached_tokens for c in self.calls),
+            cost=sum(c.usage.cost for c in self.calls),
+        )
+
+
+@dataclass(frozen=True)
+class ModuleLLM:
+    """A recorder bound to one module's name: what a module is given."""
+
+    recorder: Recorder
+    module: str
+
+    async def generate(self, purpose: str, messages: Sequence[Message], **overrides: Any) -> LLMCall:
+        """Ask the model for ``purpose``; keyword arguments override sampling fields (see :meth:`Recorder.generate`)."""
+        return await self.recorder.generate(self.module, purpose, messages, **overrides)
+
+    async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
+        """Log-probabilities of ``continuations`` after the prompt (see :meth:`LLM.score`)."""
+        return await self.recorder.llm.score(messages, continuations)
+
+    def count_tokens(self, text: str) -> int:
+        """Tokens of ``text`` for budgets of prompt sections."""
+        return self.recorder.llm.count_tokens(text)

@@ -1,0 +1,1 @@
+"""Memory modules: one file per method, named after it."""

@@ -1,0 +1,1 @@
+"""Perception: what the environment shows becomes u_t (image, instruction, state, action schema)."""

@@ -1,0 +1,1 @@
+"""Reasoning modules: one file per method, named after it."""
