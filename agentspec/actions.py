@@ -61,7 +61,9 @@ def parse_action(text: str, schema: ActionSchema) -> Action | ActionError:
     is checked: a known name, literal arguments, no unknown or missing parameter.
     """
     if len(text) > MAX_LENGTH:
-        return ActionError("PARSE_TOO_LONG", f"the answer has {len(text)} characters; write one action only", text[:200])
+        return ActionError(
+            "PARSE_TOO_LONG", f"the answer has {len(text)} characters; write one action only", text[:200]
+        )
     choice = _match_choice(text, schema)
     if choice is not None:
         return Action(choice, text=choice)
@@ -77,7 +79,9 @@ def parse_action(text: str, schema: ActionSchema) -> Action | ActionError:
     try:
         args, kwargs = _arguments(match.group(2), schema)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
-        return ActionError("PARSE_ARGS", f"the arguments of {name} cannot be read ({error}); write {spec.example}", text)
+        return ActionError(
+            "PARSE_ARGS", f"the arguments of {name} cannot be read ({error}); write {spec.example}", text
+        )
     return Action(name, args, kwargs, call)
 
 

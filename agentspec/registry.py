@@ -37,12 +37,14 @@ class Entry:
     Args:
         target: ``"package.module:Class"`` (for environments: the gymnasium id).
         calls: the call profile.
+        purposes: what its calls are for (the part of a call's path after ``/``); ``train`` patterns match these.
         needs: backend capabilities or ``"snapshots"`` of the environment.
         summary: one line for ``agentspec list``.
     """
 
     target: str
     calls: CallProfile = CallProfile()
+    purposes: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     summary: str = ""
 
@@ -53,7 +55,12 @@ class Entry:
 
     def describe(self) -> dict[str, Any]:
         """JSON of the entry, as ``agentspec list --json`` prints it."""
-        return {"summary": self.summary, "calls": asdict(self.calls), "needs": list(self.needs)}
+        return {
+            "summary": self.summary,
+            "calls": asdict(self.calls),
+            "purposes": list(self.purposes),
+            "needs": list(self.needs),
+        }
 
 
 @dataclass
@@ -89,7 +96,7 @@ REGISTRY = Registry()
 
 
 def register(kind: Kind, name: str, target: str, summary: str, **declared: Any) -> None:
-    """Register ``name``; ``declared`` are ``calls`` and ``needs`` of :class:`Entry`."""
+    """Register ``name``; ``declared`` are ``calls``, ``purposes`` and ``needs`` of :class:`Entry`."""
     REGISTRY.register(kind, name, Entry(target, summary=summary, **declared))
 
 
@@ -117,6 +124,7 @@ register(
     "agentspec.reasoning.direct:Direct",
     "answers with the action only",
     calls=CallProfile(step=(1, 1)),
+    purposes=("act",),
 )
 register(
     "reasoning",
@@ -124,13 +132,15 @@ register(
     "agentspec.reasoning.cot:ChainOfThought",
     "thinks step by step, then acts; the chain is not carried on",
     calls=CallProfile(step=(1, 2)),
+    purposes=("think", "act"),
 )
 register(
     "reasoning",
     "react",
     "agentspec.reasoning.react:ReAct",
     "a growing transcript of thought, action and observation",
-    calls=CallProfile(step=(1, 2)),
+    calls=CallProfile(step=(1, 11)),
+    purposes=("think", "act"),
 )
 register(
     "reasoning",

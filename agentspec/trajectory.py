@@ -160,7 +160,7 @@ def replay(trajectory: Trajectory, make_env: Callable[[Task], Any]) -> list[str]
         observation, info = env.reset(seed=trajectory.task.seed)
         for t in trajectory.transitions:
             compare(f"step {t.step} observation", t.input.text, observation["text"])
-            observation, reward, terminated, truncated, info = env.step(t.action_text)
+            observation, reward, terminated, _, info = env.step(t.action_text)
             if not math.isclose(t.reward, float(reward), rel_tol=0, abs_tol=1e-12):
                 compare(f"step {t.step} reward", t.reward, float(reward))
             compare(f"step {t.step} terminated", t.terminated, bool(terminated))
@@ -271,7 +271,7 @@ def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:
             )
             for c in row["completions"]
         )
-        sampling = {k: tuple(v) if isinstance(v, list) else v for k, v in row["sampling"].items()}
+        sampling: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row["sampling"].items()}
         call = LLMCall(
             id=row["id"],
             tag=CallTag(**row["tag"]),

@@ -94,7 +94,7 @@ class AgentInput:
 
 @dataclass(frozen=True)
 class RecallItem:
-    """One thing remembered: its text, a relevance score, a kind (episodic, summary, lesson, ...) and where it came from."""
+    """One thing remembered: text, relevance score, kind (episodic, summary, lesson, ...) and where it came from."""
 
     text: str
     score: float = 0.0

@@ -96,8 +96,13 @@ class LLM(Protocol):
         """
         ...
 
-    async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
-        """Sum of log-probabilities (natural, temperature 1) of each continuation after the prompt."""
+    async def score(
+        self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
+    ) -> tuple[float, ...]:
+        """Sum of log-probabilities (natural, temperature 1) of each continuation after the prompt.
+
+        ``episode`` says who asks, as ``request.tag.episode`` does in :meth:`generate`.
+        """
         ...
 
     def count_tokens(self, text: str) -> int:
@@ -111,3 +116,16 @@ class LLM(Protocol):
     def leave(self, episode: str) -> None:
         """A live episode ended; what was cached for it may go."""
         ...
+
+
+def require_context(prompt_tokens: int, max_tokens: int, max_context: int) -> None:
+    """Refuse a request that does not fit.
+
+    Raises:
+        ContextOverflowError: ``prompt_tokens + max_tokens > max_context``.
+    """
+    if prompt_tokens + max_tokens > max_context:
+        raise ContextOverflowError(
+            f"the prompt has {prompt_tokens} tokens and the answer may have {max_tokens}, but the model's context is "
+            f"{max_context}; shorten the memory budget or `max_turns`, lower `max_tokens`, or summarise"
+        )

@@ -146,7 +146,7 @@ class ModuleLLM:
 
     async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
         """Log-probabilities of ``continuations`` after the prompt (see :meth:`LLM.score`)."""
-        return await self.recorder.llm.score(messages, continuations)
+        return await self.recorder.llm.score(messages, continuations, episode=self.recorder.episode)
 
     def count_tokens(self, text: str) -> int:
         """Tokens of ``text`` for budgets of prompt sections."""

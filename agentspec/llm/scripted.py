@@ -104,7 +104,9 @@ class ScriptedLLM:
         usage = Usage(input_tokens=len(prompt), output_tokens=sum(len(c.token_ids) for c in completions))
         return LLMCall(request.id, request.tag, tuple(prompt), completions, sampling, usage, 0.0, self.name)
 
-    async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
+    async def score(
+        self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
+    ) -> tuple[float, ...]:
         """The scripted score of each continuation."""
         if self._score is None:
             return tuple(-float(len(self.tokenizer.encode(c))) for c in continuations)

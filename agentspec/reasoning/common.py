@@ -19,7 +19,7 @@ from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCa
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
 CALL_ANSWER = "Answer with exactly one action call and nothing else."
 
-_ACTION_LINE = re.compile(r"^\W*(?:final\s+)?action\W*:\W?\s*(.+)$", re.IGNORECASE | re.MULTILINE)
+_ACTION_LINE = re.compile(r"\baction[\s*`]*:[\s*`]*(\S[^\n]*)", re.IGNORECASE)
 
 
 def static_prompt(input: AgentInput, answer: str) -> str:

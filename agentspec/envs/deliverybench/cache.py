@@ -1,9 +1,10 @@
 """Compiled cities on disk and in memory.
 
-Compiling a city takes about a second, most of it all-pairs shortest paths, and a training run opens the same few cities
-in many processes. The result is kept in one `.npz` file per city, named by a hash of the two map files and of the format
-version: a changed map or a newer compiler never meets an old file. Files are written beside their final name and moved
-there in one step, so concurrent processes see a whole file or none; a file that cannot be read is compiled anew.
+Compiling a city takes up to a second, most of it all-pairs shortest paths, and a training run opens the same few
+cities in many processes. The result is kept in one `.npz` file per city, named by a hash of the two map files and of
+the format version: a changed map or a newer compiler never meets an old file. Files are written beside their final name
+and moved there in one step, so concurrent processes see a whole file or none; a file that cannot be read is compiled
+anew.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from agentspec.envs.deliverybench.compile import STREET_KINDS, Poi
-from agentspec.envs.deliverybench.graph import Edge, Graph
-from agentspec.envs.deliverybench.routing import Network
+from agentspec.envs.deliverybench.graph import Edge, Graph, all_pairs
+from agentspec.envs.deliverybench.routing import Network, Table
 
 CACHE_VARIABLE = "AGENTSPEC_CACHE"
 FORMAT = 1
@@ -66,8 +67,8 @@ def read_compiled(key: str) -> Compiled | None:
         with np.load(path, allow_pickle=False) as archive:
             meta = json.loads(archive["meta"].tobytes().decode("utf-8"))
             pois = tuple(_poi(row) for row in meta["pois"])
-            walk = _network(meta["walk"], archive["walk_dist"], archive["walk_before"], STREET_KINDS)
-            drive = _network(meta["drive"], archive["drive_dist"], archive["drive_before"], None)
+            walk = _network(meta["walk"], (archive["walk_dist"], archive["walk_before"]), STREET_KINDS)
+            drive = _network(meta["drive"], (archive["drive_dist"], archive["drive_before"]), None)
     except _UNREADABLE:
         return None
     return pois, walk, drive
@@ -77,13 +78,11 @@ def write_compiled(key: str, compiled: Compiled) -> bool:
     """Keep a compiled city; False where the cache folder cannot be written (the city then is compiled each time)."""
     pois, walk, drive = compiled
     meta = {"pois": [astuple(poi) for poi in pois], "walk": _document(walk.graph), "drive": _document(drive.graph)}
-    arrays = {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "meta": np.frombuffer(json.dumps(meta).encode("utf-8"), dtype=np.uint8),
-        "walk_dist": walk.dist,
-        "walk_before": walk.before,
-        "drive_dist": drive.dist,
-        "drive_before": drive.before,
     }
+    for name, network in (("walk", walk), ("drive", drive)):
+        arrays[f"{name}_dist"], arrays[f"{name}_before"] = network.table or all_pairs(network.graph)
     try:
         write_atomic(_path(key), _archive(arrays))
     except OSError:
@@ -123,19 +122,16 @@ def _document(graph: Graph) -> dict[str, Any]:
     }
 
 
-def _network(
-    document: dict[str, Any],
-    dist: npt.NDArray[np.float64],
-    before: npt.NDArray[np.int16],
-    kinds: frozenset[str] | None,
-) -> Network:
+def _network(document: dict[str, Any], table: Table, kinds: frozenset[str] | None) -> Network:
+    dist, before = table
     points = tuple((float(x), float(y)) for x, y in document["points"])
     edges = tuple(Edge(*row) for row in document["edges"])
     if dist.shape != (len(points), len(points)) or before.shape != dist.shape:
         raise ValueError(f"got tables {dist.shape} and {before.shape} for {len(points)} nodes")
     graph = Graph.build(points, tuple(document["kinds"]), tuple(document["names"]), edges)
-    return Network(graph, kinds, (dist, before))
+    return Network(graph, kinds, table)
 
 
 def _poi(row: list[Any]) -> Poi:
-    return Poi(*(tuple(value) if isinstance(value, list) else value for value in row))
+    values: list[Any] = [tuple(value) if isinstance(value, list) else value for value in row]
+    return Poi(*values)

@@ -22,16 +22,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.deliverybench.cache import content_key, read_compiled, write_compiled
+from agentspec.envs.deliverybench.cache import Compiled, content_key, read_compiled, write_compiled
 from agentspec.envs.deliverybench.compile import STREET_KINDS, Poi, Road, compile_drive, compile_walk, ordinal
 from agentspec.envs.deliverybench.geometry import Point, rounded
-from agentspec.envs.deliverybench.routing import DistanceField, Graph, Network, Router
+from agentspec.envs.deliverybench.graph import Graph, all_pairs
+from agentspec.envs.deliverybench.routing import DistanceField, Network, Router
 
 __all__ = ["BusRoute", "City", "MapError", "Poi", "Point", "Road", "build_city", "load_city"]
 
 ROADS_FILE = "roads.json"
 WORLD_FILE = "progen_world_enriched.json"
 CM_PER_M = 100.0
+MEMORY_LIMIT = 32
 
 _memory: dict[tuple[str, str], City] = {}
 _lock = threading.Lock()
@@ -79,7 +81,14 @@ class City:
     """
 
     def __init__(
-        self, name: str, pois: tuple[Poi, ...], roads: tuple[Road, ...], bus: BusRoute, walk: Network, drive: Network
+        self,
+        *,
+        name: str,
+        pois: tuple[Poi, ...],
+        roads: tuple[Road, ...],
+        bus: BusRoute,
+        walk: Network,
+        drive: Network,
     ) -> None:
         self.name = name
         self.pois = pois
@@ -169,7 +178,7 @@ class City:
 
 
 def build_city(name: str, roads_document: Mapping[str, Any], world_document: Mapping[str, Any]) -> City:
-    """Compile a city from the contents of its two files, without the disk cache."""
+    """Compile a city from the contents of its two files, without the disk cache; paths are searched when needed."""
     roads = _roads(roads_document)
     return _city(name, roads, world_document, _compile(roads, world_document))
 
@@ -186,6 +195,8 @@ def load_city(path: str | Path) -> City:
     with _lock:
         city = _memory.get(key)
         if city is None:
+            while len(_memory) >= MEMORY_LIMIT:
+                _memory.pop(next(iter(_memory)))
             city = _memory[key] = _load(folder, documents, *key)
         return city
 
@@ -202,7 +213,7 @@ def _load(folder: Path, documents: list[bytes], name: str, key: str) -> City:
         roads = _roads(roads_document)
         compiled = read_compiled(key)
         if compiled is None:
-            compiled = _compile(roads, world_document)
+            compiled = _with_tables(_compile(roads, world_document))
             write_compiled(key, compiled)
         return _city(name, roads, world_document, compiled)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
@@ -222,19 +233,28 @@ def _read(folder: Path, file: str) -> bytes:
         raise MapError(f"the map folder {folder} has no readable {file} ({error.strerror}): {remedy}") from error
 
 
-def _compile(roads: tuple[Road, ...], world: Mapping[str, Any]) -> tuple[tuple[Poi, ...], Network, Network]:
+def _compile(roads: tuple[Road, ...], world: Mapping[str, Any]) -> Compiled:
     graph, pois = compile_walk(roads, world["nodes"])
     return pois, Network(graph, STREET_KINDS), Network(compile_drive(roads))
+
+
+def _with_tables(compiled: Compiled) -> Compiled:
+    pois, walk, drive = compiled
+    walk, drive = (
+        Network(walk.graph, STREET_KINDS, all_pairs(walk.graph)),
+        Network(drive.graph, None, all_pairs(drive.graph)),
+    )
+    return pois, walk, drive
 
 
 def _city(
     name: str,
     roads: tuple[Road, ...],
     world: Mapping[str, Any],
-    compiled: tuple[tuple[Poi, ...], Network, Network],
+    compiled: Compiled,
 ) -> City:
     pois, walk, drive = compiled
-    return City(name, pois, roads, _bus(world), walk, drive)
+    return City(name=name, pois=pois, roads=roads, bus=_bus(world), walk=walk, drive=drive)
 
 
 def _roads(document: Mapping[str, Any]) -> tuple[Road, ...]:

@@ -8,6 +8,7 @@ rounding only the result.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 Point = tuple[float, float]
@@ -87,7 +88,7 @@ def orientation(a: Point, b: Point) -> str | None:
 
 def quarter_turn(yaw: float) -> int:
     """The multiple of 90 degrees nearest to `yaw`, one of 0, 90, 180, 270."""
-    return int(round((yaw % 360.0) / 90.0)) % 4 * 90
+    return round((yaw % 360.0) / 90.0) % 4 * 90
 
 
 def box_exit(center: Point, width: float, height: float, yaw: float, heading: float) -> Point:
@@ -113,7 +114,7 @@ def box_exit(center: Point, width: float, height: float, yaw: float, heading: fl
 
 def polyline_length(points: tuple[Point, ...]) -> float:
     """Length (cm) of a polyline."""
-    return sum(length(a, b) for a, b in zip(points[:-1], points[1:], strict=True))
+    return sum(length(a, b) for a, b in pairwise(points))
 
 
 def _distance_sq(a: Point, b: Point) -> float:

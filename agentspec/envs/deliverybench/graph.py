@@ -71,6 +71,16 @@ class Graph:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def one_way(self) -> bool:
+        """Whether any street piece can be travelled in one direction only."""
+        return any(edge.one_way for edge in self.edges)
+
+    def turned(self) -> Graph:
+        """The same network with every one-way piece turned round."""
+        edges = tuple(Edge(e.v, e.u, e.kind, e.name, True) if e.one_way else e for e in self.edges)
+        return Graph.build(self.points, self.kinds, self.names, edges)
+
 
 def shortest_paths(graph: Graph, source: int) -> tuple[list[float], list[int]]:
     """Distance (cm, `inf` if unreachable) and predecessor (`NO_NODE` at the source) of every node."""
@@ -96,7 +106,7 @@ def all_pairs(graph: Graph) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int
     """Distances (n, n) in cm and predecessors (n, n): `[s, t]` is the way from s to t, and the node before t on it."""
     size = len(graph)
     if size > np.iinfo(np.int16).max:
-        raise ValueError(f"a network of {size} nodes is larger than the {np.iinfo(np.int16).max} this table can number")
+        raise ValueError(f"got a network of {size} nodes; the table numbers at most {np.iinfo(np.int16).max}")
     dist = np.empty((size, size), dtype=np.float64)
     before = np.empty((size, size), dtype=np.int16)
     for source in range(size):

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from agentspec.envs.deliverybench.geometry import Point, along, distance, length, rounded
-from agentspec.envs.deliverybench.graph import NO_NODE, RELAX_TOLERANCE_CM, Graph, all_pairs
+from agentspec.envs.deliverybench.graph import NO_NODE, RELAX_TOLERANCE_CM, Graph, shortest_paths
 
 if TYPE_CHECKING:
     from agentspec.envs.deliverybench.compile import Poi
 
-__all__ = ["DistanceField", "Graph", "Network", "Router", "Snap", "SnapIndex"]
+__all__ = ["DistanceField", "Graph", "Network", "Router", "Snap", "SnapIndex", "Table"]
 
 CELL_CM = 2500.0
 FAR_CM = 1e8
@@ -118,43 +118,57 @@ class SnapIndex:
         return cell
 
 
-class Network:
-    """A graph with its all-pairs table and snap index: everything needed to route on it."""
+Table = tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]]
 
-    def __init__(
-        self,
-        graph: Graph,
-        kinds: frozenset[str] | None = None,
-        table: tuple[npt.NDArray[np.float64], npt.NDArray[np.int16]] | None = None,
-    ) -> None:
+
+class Network:
+    """A graph with its shortest paths and snap index: everything needed to route on it.
+
+    Shortest paths come from `table` (distances and predecessors of all pairs, see `graph.all_pairs`) where one is
+    given, and otherwise are searched per source node when first needed.
+    """
+
+    def __init__(self, graph: Graph, kinds: frozenset[str] | None = None, table: Table | None = None) -> None:
         self.graph = graph
-        self.dist, self.before = all_pairs(graph) if table is None else table
+        self.table = table
         self.snaps = SnapIndex(graph, kinds)
         self._to: dict[int, list[float]] = {}
-        self._from: dict[int, list[float]] = {}
+        self._from: dict[int, tuple[list[float], list[int]]] = {}
+        self._turned = graph.turned() if graph.one_way else graph
 
     def to_node(self, node: int) -> list[float]:
         """Distance (cm) from every node to `node`."""
         row = self._to.get(node)
         if row is None:
-            row = self._to[node] = self.dist[:, node].tolist()
+            table = self.table
+            row = shortest_paths(self._turned, node)[0] if table is None else table[0][:, node].tolist()
+            self._to[node] = row
         return row
 
     def from_node(self, node: int) -> list[float]:
         """Distance (cm) from `node` to every node."""
-        row = self._from.get(node)
-        if row is None:
-            row = self._from[node] = self.dist[node].tolist()
-        return row
+        return self._tree(node)[0]
+
+    def _tree(self, node: int) -> tuple[list[float], list[int]]:
+        tree = self._from.get(node)
+        if tree is None:
+            table = self.table
+            tree = (
+                shortest_paths(self.graph, node)
+                if table is None
+                else (table[0][node].tolist(), table[1][node].tolist())
+            )
+            self._from[node] = tree
+        return tree
 
     def path(self, source: int, target: int) -> Route:
         """Node positions of the shortest path between two nodes, both included; empty if there is none."""
-        if not math.isfinite(self.dist[source, target]):
+        dist, before = self._tree(source)
+        if not math.isfinite(dist[target]):
             return ()
-        before = self.before[source]
         nodes = [target]
         while nodes[-1] != source:
-            nodes.append(int(before[nodes[-1]]))
+            nodes.append(before[nodes[-1]])
         return tuple(self.graph.points[n] for n in reversed(nodes))
 
     def between(self, a: Snap, b: Snap) -> list[Point] | None:

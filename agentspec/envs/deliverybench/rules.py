@@ -117,6 +117,7 @@ class Rules:
     hospital_carries_vehicle: bool = quirk("The hospital takes the ridden vehicle along and drains the scooter for it.")
     ghost_car: bool = quirk("A car taken back for unpaid rent can still be driven, free of charge, until SWITCH.")
     bare_pickup_fails: bool = quirk("PICKUP() without a list never works, although one order may be ready here.")
+    zero_id_fails: bool = quirk("ACCEPT_ORDER(order_id=0) is unreadable because 0 counts as missing.")
     bare_numbers_are_cm: bool = quirk("Coordinates without the unit m are centimetres.")
     handoff_hidden: bool = quirk("The point where a customer takes the food by hand is never told.")
     odd_bus_line: bool = quirk("The bus serves the terminal twice and uses wrong leg lengths on the way back.")

@@ -82,7 +82,7 @@ class State:
     the accepted, undelivered orders by id; ``settlements`` the delivered ones in order of delivery. ``pool`` lists the
     ids on offer and ``next_order`` the id that will be drawn next. ``recent`` are the last five successful actions,
     oldest first; ``error`` is the last failure until something succeeds; ``notices`` last until the next action that
-    clears them. ``hospital_until`` is the tick of release. ``interrupt_at`` is the tick at which a pending
+    clears them. ``hospital_until`` is the tick of release. ``hands_at`` is the tick up to which food in the hand has cooled. ``interrupt_at`` is the tick at which a pending
     interruption strikes. ``reason`` is "" until the episode ends.
     """
 
@@ -111,7 +111,7 @@ class State:
     hospital_until: int | None = None
     interrupt_at: int | None = None
     riding_to: str = ""
-    help_posts: list[str] = field(default_factory=list)
+    hands_at: int = 0
     reason: str = ""
 
     @property

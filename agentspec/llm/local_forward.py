@@ -1,0 +1,278 @@
+"""The packed forward pass: many sequences, one row of tokens, no padding.
+
+The new tokens of all sequences stand side by side in one row of shape (1, T) with their own position ids. Everything in a
+decoder except attention works on single tokens and does not notice. Attention is ours: it is registered with transformers
+as one more attention function, stores the new keys and values in the sequences' slots, and lets each segment look at its
+own slot only. So a batch of unequal prompts costs exactly its new tokens, a prefix that sequences of one batch share is
+computed once and copied, and reading a prompt, decoding and forced runs of tokens are the same operation.
+
+It works with every decoder that uses the attention interface of transformers, whatever its weights (float types, LoRA
+adapters); :meth:`PackedModel.check` compares it with the model's ordinary forward before its first use.
+"""
+
+from __future__ import annotations
+
+import inspect
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from agentspec.llm.base import LLMError
+from agentspec.llm.local_cache import Slot
+
+_ATTENTION = "agentspec_packed"
+_ACTIVE = threading.local()
+
+
+@dataclass
+class Segment:
+    """Consecutive new tokens of one sequence.
+
+    Args:
+        slot: where the keys and values of the sequence are; its first ``start`` positions are known.
+        tokens: ids at positions ``start ...``.
+        start: position of the first of ``tokens``.
+        logits: number of last positions whose logits are wanted (0: none).
+        source: another slot that holds the same tokens up to ``start``; positions from ``known`` on are copied from it
+            while the batch runs (it may be filled by an earlier segment of the same batch).
+        known: number of positions the slot itself already holds.
+    """
+
+    slot: Slot
+    tokens: Sequence[int]
+    start: int
+    logits: int = 1
+    source: Slot | None = None
+    known: int = 0
+
+
+@dataclass
+class _Pack:
+    segments: Sequence[Segment]
+    bounds: list[tuple[int, int]]
+    masks: dict[tuple[int, int, int, int], torch.Tensor] = field(default_factory=dict)
+
+
+class PackedModel:
+    """A live transformers model behind :meth:`forward`; it is never moved, cast or left changed.
+
+    Raises:
+        LLMError: the architecture cannot be driven by position ids, or keeps a state other than keys and values.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        base = model.get_base_model() if hasattr(model, "get_base_model") else model
+        self.config = base.config
+        parameters = inspect.signature(base.forward).parameters
+        text = self.config.get_text_config() if hasattr(self.config, "get_text_config") else self.config
+        if "position_ids" not in parameters or getattr(base, "_is_stateful", False):
+            raise LLMError(
+                f"{type(base).__name__} cannot run in the local backend: it takes no position ids or keeps a recurrent "
+                "state; serve it (vLLM) and use the `openai` backend"
+            )
+        self.layers = int(text.num_hidden_layers)
+        self.max_context = int(getattr(text, "max_position_embeddings", None) or 1 << 30)
+        self._keeps = "logits_to_keep" in parameters
+        self._checked = False
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is now."""
+        return next(self.model.parameters()).device
+
+    def forward(self, segments: Sequence[Segment]) -> list[torch.Tensor]:
+        """Run all segments, in order; per segment the float32 logits of its last ``logits`` positions, (logits, V).
+
+        Slots are extended (``length``) by what was computed. Call inside :meth:`session`.
+        """
+        device = self.device
+        bounds, tokens, positions, wanted = [], [], [], []
+        for s in segments:
+            s.slot.reserve(s.start + len(s.tokens))
+            begin = len(tokens)
+            tokens.extend(s.tokens)
+            positions.extend(range(s.start, s.start + len(s.tokens)))
+            bounds.append((begin, len(tokens)))
+            wanted.extend(range(len(tokens) - s.logits, len(tokens)))
+        ids = torch.tensor([tokens], device=device)
+        keep = torch.tensor(wanted, dtype=torch.long, device=device)
+        arguments: dict[str, Any] = {"logits_to_keep": keep} if self._keeps and wanted else {}
+        if self._keeps and not wanted:
+            arguments = {"logits_to_keep": 1}
+        _ACTIVE.pack = _Pack(segments, bounds)
+        try:
+            out = self.model(
+                input_ids=ids,
+                position_ids=torch.tensor([positions], device=device),
+                use_cache=False,
+                return_dict=True,
+                **arguments,
+            )
+        finally:
+            _ACTIVE.pack = None
+        for s in segments:
+            s.slot.length = s.start + len(s.tokens)
+        logits = out.logits[0] if self._keeps else out.logits[0][keep]
+        if not wanted:
+            logits = logits[:0]
+        return list(logits.float().split([s.logits for s in segments]))
+
+    @contextmanager
+    def session(self) -> Iterator[None]:
+        """Evaluation mode, no gradients, our attention; everything as before at the end."""
+        _register()
+        training, configs = [], {}
+        for module in self.model.modules():
+            if module.training:
+                training.append(module)
+                module.training = False
+            config = getattr(module, "config", None)
+            if hasattr(config, "_attn_implementation_internal"):
+                configs.setdefault(id(config), (config, config._attn_implementation_internal))
+        try:
+            for config, _ in configs.values():
+                config._attn_implementation_internal = _ATTENTION
+            with torch.no_grad():
+                yield
+        finally:
+            for config, implementation in configs.values():
+                config._attn_implementation_internal = implementation
+            for module in training:
+                module.training = True
+
+    def check(self) -> None:
+        """Compare the packed forward with the model's own on a few tokens, once.
+
+        Raises:
+            LLMError: they differ: the architecture does something the packed forward does not know.
+        """
+        if self._checked:
+            return
+        vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
+        tokens = [(7 * i * i + 3 * i + 1) % vocabulary for i in range(12)]
+        with self.session():
+            slots = [Slot(self.layers, 16), Slot(self.layers, 16)]
+            packed = [
+                self.forward([Segment(slots[0], tokens[:5], 0)]),
+                # The rest of the first, packed beside a second sequence that copies its beginning.
+                self.forward(
+                    [Segment(slots[0], tokens[5:], 5), Segment(slots[1], tokens[8:], 8, source=slots[0])]
+                ),
+            ]
+        configured = self.model.training
+        self.model.eval()
+        try:
+            with torch.no_grad():
+                ids = torch.tensor([tokens], device=self.device)
+                plain = self.model(input_ids=ids, use_cache=False).logits[0].float()
+        finally:
+            self.model.train(configured)
+        expected = torch.stack([plain[4], plain[11], plain[11]])
+        got = torch.cat([packed[0][0], *packed[1]])
+        scale = (expected - expected.mean(-1, keepdim=True)).norm()
+        error = float((got - expected).norm() / scale)
+        limit = 1e-3 if plain.dtype == torch.float32 and self._dtype() == torch.float32 else 0.1
+        if not error <= limit:
+            raise LLMError(
+                f"the local backend does not compute {type(self.model).__name__} ({self.config.model_type}) correctly: its "
+                f"logits differ by {error:.2g} of their size from the model's own (at most {limit:g} is rounding); serve "
+                "the model (vLLM) and use the `openai` backend"
+            )
+        self._checked = True
+
+    def _dtype(self) -> torch.dtype:
+        return next(self.model.parameters()).dtype
+
+
+def _register() -> None:
+    from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
+
+    if _ATTENTION not in ALL_ATTENTION_FUNCTIONS:
+        # No mask function is registered with it, so that transformers builds no (T, T) mask.
+        ALL_ATTENTION_FUNCTIONS.register(_ATTENTION, packed_attention)
+
+
+def packed_attention(
+    module: torch.nn.Module,
+    query: torch.Tensor,
+    key: torch.Tensor,
+    value: torch.Tensor,
+    attention_mask: torch.Tensor | None = None,
+    scaling: float | None = None,
+    sliding_window: int | None = None,
+    softcap: float | None = None,
+    s_aux: torch.Tensor | None = None,
+    **_: Any,
+) -> tuple[torch.Tensor, None]:
+    """Attention of the active pack: ``query`` (1, heads, T, size) to each segment's own slot; (1, T, heads, size)."""
+    pack: _Pack | None = getattr(_ACTIVE, "pack", None)
+    if pack is None:
+        raise LLMError("the model was used by another thread while the local backend sampled from it; take turns")
+    layer = int(module.layer_idx)  # type: ignore[arg-type]
+    heads, kv_heads = query.shape[1], key.shape[1]
+    groups = heads // kv_heads
+    out = query.new_empty(1, query.shape[2], heads, value.shape[-1])
+    for segment, (begin, end) in zip(pack.segments, pack.bounds, strict=True):
+        slot, n = segment.slot, end - begin
+        if segment.source is not None and segment.start > segment.known:
+            slot.copy_layer(layer, segment.source, segment.known, segment.start)
+        slot.write(layer, segment.start, key[0, :, begin:end], value[0, :, begin:end])
+        total = segment.start + n
+        keys, values = slot.keys[layer], slot.values[layer]
+        assert keys is not None and values is not None
+        # Query heads of one key-value head are laid side by side as more queries: keys are read once, never repeated.
+        q = query[:, :, begin:end].reshape(1, kv_heads, groups * n, -1)
+        k, v = keys[None, :, :total], values[None, :, :total]
+        mask = _mask(pack, n, total, groups, sliding_window or 0, q)
+        if softcap is None and s_aux is None:
+            o = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scaling)
+        else:
+            o = _attend(q, k, v, mask, scaling, softcap, s_aux)
+        out[0, begin:end] = o.reshape(heads, n, -1).transpose(0, 1)
+    return out, None
+
+
+def _mask(pack: _Pack, n: int, total: int, groups: int, window: int, like: torch.Tensor) -> torch.Tensor | None:
+    """Additive mask (groups * n, total) of the last ``n`` of ``total`` positions; ``None`` if nothing is hidden."""
+    if n == 1 and not 0 < window < total:
+        return None
+    cached = pack.masks.get((n, total, groups, window))
+    if cached is None:
+        here = torch.arange(total - n, total, device=like.device)[:, None]
+        there = torch.arange(total, device=like.device)[None]
+        hidden = there > here
+        if window:
+            hidden |= there <= here - window
+        cached = torch.zeros(n, total, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
+        cached = pack.masks[n, total, groups, window] = cached.repeat(groups, 1)
+    return cached
+
+
+def _attend(
+    q: torch.Tensor,
+    k: torch.Tensor,
+    v: torch.Tensor,
+    mask: torch.Tensor | None,
+    scaling: float | None,
+    softcap: float | None,
+    sinks: torch.Tensor | None,
+) -> torch.Tensor:
+    """Attention written out, for what the fused kernel lacks: soft-capped scores, and attention sinks (one per head)."""
+    scores = torch.matmul(q, k.transpose(-1, -2)).float() * (q.shape[-1] ** -0.5 if scaling is None else scaling)
+    if softcap is not None:
+        scores = torch.tanh(scores / softcap) * softcap
+    if mask is not None:
+        scores = scores + mask.float()
+    if sinks is not None:
+        per_query = sinks.float().reshape(1, k.shape[1], -1, 1).repeat_interleave(
+            q.shape[2] // (sinks.numel() // k.shape[1]), dim=2
+        )
+        scores = torch.cat([scores, per_query], dim=-1)
+    weights = scores.softmax(-1)[..., : k.shape[2]]
+    return torch.matmul(weights.to(v.dtype), v)

@@ -1,0 +1,255 @@
+"""Invariants 1, 3 and 4 where they bite: the gradient that reaches the optimiser.
+
+Episodes are prebuilt (random tokens), so that stock TRL and this trainer see exactly the same data.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("trl")
+
+from datasets import Dataset
+from transformers import TrainerCallback
+from trl import GRPOConfig, GRPOTrainer
+
+from agentspec.llm.base import LLM
+from agentspec.registry import SpecError
+from agentspec.trajectory import Trajectory
+from agentspec.types import Task
+from tests.tiny import tiny_model, tiny_tokenizer
+from tests.trainers.builders import call, episode
+from trainers import grpo as grpo_module
+from trainers.batches import Row, collate, rows_logprobs
+from trainers.config import ScaffoldConfig
+from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.rollouts import task_rows
+from trainers.sequences import build_sequences
+
+GROUPS, GENERATIONS = 2, 4
+RETURNS = [15.0, 10.0, 5.0, 15.0, 1.0, 0.0, 0.0, 0.5]
+
+
+class GradientSpy(TrainerCallback):
+    """Keeps the gradients of the first optimiser step and counts the steps."""
+
+    def __init__(self) -> None:
+        self.gradients: dict[str, torch.Tensor] = {}
+        self.steps = 0
+
+    def on_pre_optimizer_step(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        self.steps += 1
+        if not self.gradients:
+            named = kwargs["model"].named_parameters()
+            self.gradients = {n: p.grad.clone() for n, p in named if p.grad is not None}
+
+
+def settings(tmp_path: Any, **changes: Any) -> dict[str, Any]:
+    return {
+        "output_dir": str(tmp_path),
+        "per_device_train_batch_size": 4,
+        "gradient_accumulation_steps": 2,
+        "num_generations": GENERATIONS,
+        "max_steps": 1,
+        "learning_rate": 1e-3,
+        "lr_scheduler_type": "constant",
+        "max_grad_norm": 0.0,
+        "optim": "sgd",
+        "report_to": [],
+        "use_cpu": True,
+        "bf16": False,
+        "gradient_checkpointing": False,
+        "save_strategy": "no",
+        "logging_steps": 1,
+        "disable_tqdm": True,
+        "max_completion_length": 40,
+        "shuffle_dataset": False,
+        **changes,
+    }
+
+
+def random_calls(seed: int, turns: int, vocabulary: int = 250) -> list[Any]:
+    """An append-only conversation of ``turns`` calls with random tokens (log-probs are filled in by the model)."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(low: int, high: int) -> list[int]:
+        n = int(torch.randint(low, high, (1,), generator=g))
+        return torch.randint(0, vocabulary, (n,), generator=g).tolist()
+
+    prompt, calls = draw(3, 9), []
+    for i in range(turns):
+        answer = draw(2, 6)
+        calls.append(call(i, prompt, answer, step=i))
+        prompt = prompt + answer + draw(2, 5)
+    return calls
+
+
+def spied(trainer: GRPOTrainer) -> GradientSpy:
+    spy = GradientSpy()
+    trainer.add_callback(spy)
+    trainer.train()
+    return spy
+
+
+def ours(tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any = None, **changes: Any) -> GradientSpy:
+    tokenizer = tiny_tokenizer()
+    tasks = task_rows([Task("toy", i) for i in range(GROUPS)])
+    trainer = ScaffoldGRPOTrainer(
+        model or tiny_model(tokenizer),
+        ScaffoldConfig(**settings(tmp_path, **changes)),
+        train_dataset=Dataset.from_list(tasks),
+        processing_class=tokenizer,
+        make_llm=lambda model, tokenizer: object.__new__(type("Unused", (LLM,), {})),
+    )
+    monkeypatch.setattr(grpo_module, "collect", lambda runner, jobs: episodes)
+    return spied(trainer)
+
+
+def relative_difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
+    assert a.keys() == b.keys()
+    difference = math.sqrt(sum((a[n] - b[n]).square().sum().item() for n in a))
+    return difference / math.sqrt(sum(g.square().sum().item() for g in b.values()))
+
+
+@pytest.mark.parametrize("loss_type", ["dapo", "cispo", "grpo", "dr_grpo", "bnpo"])
+def test_single_sequence_work_equals_stock_trl(tmp_path: Any, monkeypatch: Any, loss_type: str) -> None:
+    episodes = [episode(random_calls(i, turns=3), [r], rollout=i % 4) for i, r in enumerate(RETURNS)]
+    # bnpo normalises each micro-batch by its own tokens: only one micro-batch makes the comparison well defined.
+    one = {"per_device_train_batch_size": 8, "gradient_accumulation_steps": 1} if loss_type == "bnpo" else {}
+    spy = ours(tmp_path / "ours", episodes, monkeypatch, loss_type=loss_type, **one)
+
+    sequences = [build_sequences(e)[0] for e in episodes]
+
+    def rollout_func(prompts: list[Any], trainer: Any) -> dict[str, Any]:
+        return {
+            "prompt_ids": [s.tokens[:1] for s in sequences],
+            "completion_ids": [s.tokens[1:] for s in sequences],
+            "env_mask": [s.mask[1:] for s in sequences],
+            "logprobs": [s.logprobs[1:] for s in sequences],
+            "value": RETURNS,
+        }
+
+    tokenizer = tiny_tokenizer()
+    stock = GRPOTrainer(
+        tiny_model(tokenizer),
+        reward_funcs=lambda value, **_: value,
+        args=GRPOConfig(**settings(tmp_path / "stock", loss_type=loss_type, **one)),
+        train_dataset=Dataset.from_list([{"prompt": str(i)} for i in range(GROUPS)]),
+        processing_class=tokenizer,
+        rollout_func=rollout_func,
+    )
+    assert relative_difference(spy.gradients, spied(stock).gradients) < 1e-5
+
+
+def manual_gradient(rows: list[tuple[Any, float]], model: Any) -> dict[str, torch.Tensor]:
+    """-sum(A log p) / (number of trained tokens), token by token, one plain forward per row."""
+    total = sum(s.trained for s, _ in rows)
+    for sequence, advantage in rows:
+        logits = model(input_ids=torch.tensor([sequence.tokens])).logits[0].float()
+        loss = torch.zeros(())
+        for position, trained in enumerate(sequence.mask):
+            if trained:
+                scores = logits[position - 1] / sequence.temperatures[position]
+                allowed = sequence.allowed.get(position)
+                if allowed is not None:
+                    outside = torch.ones_like(scores, dtype=torch.bool)
+                    outside[list(allowed)] = False
+                    scores = scores.masked_fill(outside, -torch.inf)
+                log_p = scores.log_softmax(-1)[sequence.tokens[position]]
+                loss = loss - advantage * log_p / total
+        loss.backward()
+    return {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+
+
+def uneven_episodes() -> list[Trajectory]:
+    """1 to 3 rows per episode: 13 rows in all, which 2 micro-batches do not divide."""
+    episodes = []
+    for i, (rows, value) in enumerate(zip([3, 1, 1, 2, 1, 2, 1, 2], RETURNS, strict=True)):
+        calls = []
+        for r in range(rows):
+            calls += [
+                call(len(calls) + j, [r, *c.prompt_ids], list(c.completions[0].token_ids), temperature=0.7 + 0.3 * r)
+                for j, c in enumerate(random_calls(100 * i + r, 1))
+            ]
+        episodes.append(episode(calls, [value], rollout=i % 4))
+    return episodes
+
+
+def test_uneven_rows_give_the_full_batch_gradient_in_one_step(tmp_path: Any, monkeypatch: Any) -> None:
+    episodes = uneven_episodes()
+    spy = ours(tmp_path, episodes, monkeypatch, loss_type="dapo")
+    assert spy.steps == 1
+    returns = torch.tensor(RETURNS).view(GROUPS, GENERATIONS)
+    # TRL's convention: sample deviation + 1e-4.
+    advantages = ((returns - returns.mean(1, keepdim=True)) / (returns.std(1, keepdim=True) + 1e-4)).flatten()
+    rows = [(s, advantages[i].item()) for i, e in enumerate(episodes) for s in build_sequences(e)]
+    assert len(rows) == 13
+    assert relative_difference(spy.gradients, manual_gradient(rows, tiny_model(tiny_tokenizer()))) < 1e-5
+
+
+def test_constrained_tokens_have_the_gradient_of_the_constrained_policy(tmp_path: Any, monkeypatch: Any) -> None:
+    episodes = []
+    for i, value in enumerate(RETURNS):
+        c = call(0, [1, 2, 3 + i], [5, 7, 9], allowed=((5, 6, 8), (7,), (9, 10)), logprobs=[-1.0, 0.0, -1.0])
+        episodes.append(episode([c], [value], rollout=i % 4))
+    spy = ours(tmp_path, episodes, monkeypatch)
+    returns = torch.tensor(RETURNS).view(GROUPS, GENERATIONS)
+    advantages = ((returns - returns.mean(1, keepdim=True)) / (returns.std(1, keepdim=True) + 1e-4)).flatten()
+    rows = [(s, advantages[i].item()) for i, e in enumerate(episodes) for s in build_sequences(e)]
+    assert all(s.trained == 2 for s, _ in rows)
+    assert relative_difference(spy.gradients, manual_gradient(rows, tiny_model(tiny_tokenizer()))) < 1e-5
+
+
+def test_a_failed_rollout_counts_nowhere(tmp_path: Any, monkeypatch: Any) -> None:
+    episodes = [episode(random_calls(i, 1), [r], rollout=i % 4) for i, r in enumerate(RETURNS)]
+    episodes[1] = episode(random_calls(1, 1), [1e6], status="failed", rollout=1)
+    spy = ours(tmp_path, episodes, monkeypatch)
+    # Group 0 without its second member: returns 15, 5, 15 have mean 11.667 and sample deviation 5.774.
+    first = torch.tensor([15.0, 5.0, 15.0])
+    a = ((first - first.mean()) / (first.std() + 1e-4)).tolist()
+    second = torch.tensor(RETURNS[4:])
+    b = ((second - second.mean()) / (second.std() + 1e-4)).tolist()
+    advantages = [a[0], None, a[1], a[2], *b]
+    rows = [(build_sequences(e)[0], v) for e, v in zip(episodes, advantages, strict=True) if v is not None]
+    assert relative_difference(spy.gradients, manual_gradient(rows, tiny_model(tiny_tokenizer()))) < 1e-5
+
+
+def test_groups_without_variance_leave_the_policy_alone(tmp_path: Any, monkeypatch: Any) -> None:
+    episodes = [episode(random_calls(i, 1), [3.0], rollout=i % 4) for i in range(8)]
+    spy = ours(tmp_path, episodes, monkeypatch)
+    assert spy.steps == 1
+    assert all(g.abs().max() == 0 for g in spy.gradients.values())
+
+
+def test_padded_forwards_equal_row_by_row_ones() -> None:
+    tokenizer = tiny_tokenizer()
+    model = tiny_model(tokenizer)
+    rows = [Row(s, 1.0, i) for i, e in enumerate(uneven_episodes()) for s in build_sequences(e)]
+    alone, _ = rows_logprobs(model, rows, rows_per_forward=1)
+    together, _ = rows_logprobs(model, rows, rows_per_forward=5)
+    mask = collate(rows, 0)["tool_mask"]
+    assert mask.sum() > 0 and torch.allclose(alone, together, atol=1e-5)
+    assert (alone * (1 - mask)).abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train_calls": ["reflection.*"]}, "match no call"),
+        ({"agent": {"reasoning": "direct", "sampling": {"top_p": 0.9}}}, "top_p"),
+        ({"agent": {"reasoning": "direct", "sampling": {"temperature": 0}}}, "temperature"),
+        ({"agent": {"reasoning": "raect"}}, "did you mean react"),
+        ({"loss_type": "luspo"}, "not offered"),
+        ({"estimator": "gpro"}, "did you mean grpo"),
+        ({"rewards": {"earnings": 1.0}}, "earning_delta"),
+        ({"importance_sampling_level": "sequence"}, "speaks of rows"),
+        ({"env": {"map": "x"}}, "expected {name"),
+    ],
+)
+def test_what_cannot_work_is_refused_at_start(tmp_path: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=message.replace("{", r"\{")):
+        ScaffoldConfig(**settings(tmp_path, **changes)).check()

@@ -1,0 +1,1 @@
+"""Trainers: episodes run inside the scaffold become exact policy-gradient updates."""

@@ -1,0 +1,167 @@
+"""Rows -> micro-batches, and the log-probabilities of a micro-batch.
+
+The number of micro-batches is fixed by the configuration; the number of rows is not. Rows are dealt so that every
+micro-batch holds the same number of rows (short of one) and about the same number of tokens; empty places are filled
+with rows that train nothing. So no row is ever lost and the number of optimiser steps never depends on the scaffold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from trainers.logprobs import sampled_logprobs
+from trainers.sequences import TokenSequence
+
+
+@dataclass(frozen=True)
+class Row:
+    """One sequence with its advantage: a number, or one per token for step-level estimators."""
+
+    sequence: TokenSequence
+    advantage: float | tuple[float, ...]
+    episode: int
+
+    @property
+    def silent(self) -> bool:
+        """Whether the row has no policy gradient: nothing trained, or advantage zero throughout."""
+        values = (self.advantage,) if isinstance(self.advantage, (int, float)) else self.advantage
+        return self.sequence.trained == 0 or not any(values)
+
+
+def blank_row(token: int) -> Row:
+    """A row of two tokens that trains nothing: fills a place."""
+    sequence = TokenSequence()
+    sequence.extend_context([token, token])
+    return Row(sequence, 0.0, -1)
+
+
+def deal(rows: Sequence[Row], hands: int, *, blank: Row, rows_per_hand: int = 0) -> list[list[Row]]:
+    """Deal rows into ``hands`` micro-batches of equal size, balancing tokens.
+
+    Longest first, each row goes to the hand with the fewest tokens that still has room. ``rows_per_hand`` asks for more
+    room than the rows need (another rank has more).
+
+    Raises:
+        ValueError: ``rows_per_hand`` is too small.
+    """
+    size = max(rows_per_hand, -(-len(rows) // hands), 1)
+    if rows_per_hand and rows_per_hand * hands < len(rows):
+        raise ValueError(f"{len(rows)} rows do not fit into {hands} micro-batches of {rows_per_hand}")
+    dealt: list[list[Row]] = [[] for _ in range(hands)]
+    tokens = [0] * hands
+    for row in sorted(rows, key=lambda r: -len(r.sequence)):
+        hand = min((h for h in range(hands) if len(dealt[h]) < size), key=lambda h: (tokens[h], h))
+        dealt[hand].append(row)
+        tokens[hand] += len(row.sequence)
+    return [hand + [blank] * (size - len(hand)) for hand in dealt]
+
+
+def collate(
+    rows: Sequence[Row], pad: int, device: torch.device | str = "cpu", *, skip_silent: bool = False
+) -> dict[str, torch.Tensor]:
+    """The tensors TRL's loss reads, right-padded; the first token stands as the prompt, all others as completion.
+
+    With ``skip_silent`` the mask of rows without a policy gradient is empty, so that metrics leave them out as the
+    forward does (they still count in the loss denominator, which is computed before).
+
+    Shapes with B rows of at most L tokens: ``prompt_ids``, ``prompt_mask`` (B, 1); ``completion_ids``,
+    ``completion_mask``, ``tool_mask`` and ``sampled_logprobs`` (B, L-1); ``advantages`` (B,) or, if any row has one per
+    token, (B, L-1).
+    """
+    length = max(len(r.sequence) for r in rows)
+    ids = torch.full((len(rows), length), pad, dtype=torch.long)
+    attention = torch.zeros_like(ids)
+    mask = torch.zeros_like(ids)
+    logprobs = torch.zeros(len(rows), length)
+    per_token = any(not isinstance(r.advantage, (int, float)) for r in rows)
+    advantages = torch.zeros(len(rows), length) if per_token else torch.zeros(len(rows))
+    for i, row in enumerate(rows):
+        n = len(row.sequence)
+        ids[i, :n] = torch.tensor(row.sequence.tokens)
+        attention[i, :n] = 1
+        if not (skip_silent and row.silent):
+            mask[i, :n] = torch.tensor(row.sequence.mask)
+        logprobs[i, :n] = torch.tensor(row.sequence.logprobs)
+        if per_token:
+            advantages[i, :n] = torch.tensor(row.advantage)
+        else:
+            advantages[i] = row.advantage  # type: ignore[assignment]  # a number: per_token is False
+    batch = {
+        "prompt_ids": ids[:, :1],
+        "prompt_mask": attention[:, :1],
+        "completion_ids": ids[:, 1:],
+        "completion_mask": attention[:, 1:],
+        "tool_mask": mask[:, 1:],
+        "sampled_logprobs": logprobs[:, 1:],
+        "advantages": advantages[:, 1:] if per_token else advantages,
+    }
+    return {name: tensor.to(device) for name, tensor in batch.items()}
+
+
+def rows_logprobs(
+    model: nn.Module, rows: Sequence[Row], *, skip_silent: bool = False, rows_per_forward: int = 1
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-probabilities and entropies of all trained tokens of a micro-batch, one padded forward per chunk of rows.
+
+    Logits are computed only where a token is trained. Untrained places hold 0.
+
+    Args:
+        skip_silent: leave out rows without a policy gradient (their values stay 0).
+        rows_per_forward: 1 wastes nothing on padding (a CPU's best); more fills a GPU.
+
+    Returns:
+        two float32 tensors of shape (B, L-1), aligned with ``completion_ids`` of :func:`collate`.
+    """
+    device = next(model.parameters()).device
+    length = max(len(r.sequence) for r in rows)
+    logps = torch.zeros(len(rows), length - 1, device=device)
+    entropies = torch.zeros(len(rows), length - 1, device=device)
+    todo = [i for i, r in enumerate(rows) if r.sequence.trained and not (skip_silent and r.silent)]
+    if rows_per_forward > 1:
+        todo.sort(key=lambda i: len(rows[i].sequence))
+    for start in range(0, len(todo), rows_per_forward):
+        chunk = todo[start : start + rows_per_forward]
+        places, logp, entropy = _forward(model, [rows[i].sequence for i in chunk], device)
+        index = (torch.tensor([chunk[r] for r, _ in places], device=device), _positions(places, device) - 1)
+        logps = logps.index_put(index, logp)
+        entropies = entropies.index_put(index, entropy.detach())
+    if not todo:
+        logps = logps + 0.0 * sum(p.sum() for p in model.parameters() if p.requires_grad)
+    return logps, entropies
+
+
+def _positions(places: Sequence[tuple[int, int]], device: torch.device) -> torch.Tensor:
+    return torch.tensor([p for _, p in places], device=device)
+
+
+def _forward(
+    model: nn.Module, sequences: Sequence[TokenSequence], device: torch.device
+) -> tuple[list[tuple[int, int]], torch.Tensor, torch.Tensor]:
+    """(row, position) of every trained token of a padded chunk, with log-probability and entropy."""
+    length = max(len(s) for s in sequences)
+    ids = torch.zeros(len(sequences), length, dtype=torch.long)
+    attention = torch.zeros_like(ids)
+    for i, s in enumerate(sequences):
+        ids[i, : len(s)] = torch.tensor(s.tokens)
+        attention[i, : len(s)] = 1
+    places = [(i, p) for i, s in enumerate(sequences) for p, m in enumerate(s.mask) if m]
+    # The logits before a token decide it. Only positions that some row trains are projected on the vocabulary.
+    keep = sorted({p - 1 for _, p in places})
+    column = {p: k for k, p in enumerate(keep)}
+    logits = model(
+        input_ids=ids.to(device),
+        attention_mask=attention.to(device),
+        logits_to_keep=torch.tensor(keep, device=device),
+        use_cache=False,
+    ).logits
+    rows = torch.tensor([r for r, _ in places], device=device)
+    columns = torch.tensor([column[p - 1] for _, p in places], device=device)
+    tokens = torch.tensor([sequences[r].tokens[p] for r, p in places], device=device)
+    temperatures = torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device)
+    allowed = [sequences[r].allowed.get(p) for r, p in places]
+    logp, entropy = sampled_logprobs(logits[rows, columns], tokens, temperatures, allowed)
+    return places, logp, entropy

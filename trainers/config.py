@@ -1,0 +1,206 @@
+"""The configuration of a run: TRL's ``GRPOConfig`` plus what the scaffold adds, in one dataclass.
+
+``TrlParser`` fills it from a YAML file and from the command line; no other class mirrors it. ``check`` refuses at start
+what cannot work or would not be exact, with the reason and the remedy.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from trl import GRPOConfig
+
+from agentspec.actions import suggest
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.spec import MODULE_KINDS, AgentSpec, load_yaml
+from rewards import RewardSet
+from trainers.advantages import ESTIMATORS
+from trainers.sequences import TrainFilter, unmatched_patterns
+
+EXACT_LOSSES = ("dapo", "cispo")
+"""Loss types normalised by all trained tokens of the update: the same objective however many rows an episode has."""
+
+ROW_LOSSES = {
+    "grpo": "each row weighs the same, so an episode of three rows weighs three times one of a single row",
+    "bnpo": "each micro-batch is normalised by its own tokens, so the weights depend on how rows were dealt",
+    "dr_grpo": "the sum is divided by rows x max_completion_length, so the scale falls as rows per episode grow",
+}
+"""Loss types that depend on how episodes split into rows, and how."""
+
+REFUSED_LOSSES = {
+    "luspo": "it sums per row, so an episode counts once per row",
+    "sapo": "it averages per row and has no test against stock TRL here",
+    "vespo": "its weights are products over one row, not over the episode",
+}
+
+
+@dataclass
+class ScaffoldConfig(GRPOConfig):
+    """``trl.GRPOConfig`` and what training inside a scaffold needs.
+
+    Args:
+        model: what :func:`agentspec.llm.models.resolve` understands: a folder, ``smollm2-135m`` or a hub id.
+        adapter: PEFT folder to start from (a warm start), or empty.
+        agent: the agent spec: a mapping, or a path to a YAML file.
+        env: ``{name: ..., options: {...}}``: the environment and its ``gymnasium.make`` arguments.
+        train_tasks: number of distinct training tasks (seeds ``0 .. train_tasks - 1``).
+        eval_tasks: number of held-out tasks (seeds ``20000 ..``) for evaluation after training.
+        train_calls: patterns over ``module/purpose`` of the calls that are trained.
+        train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
+        rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
+        estimator: how returns become advantages (``grpo``, ``centred``, ``rloo``).
+        env_timeout_s: limit of one environment call, in seconds.
+        rollout_concurrency: most episodes at once (0: all of a generation batch).
+        rows_per_forward: rows per forward in the update (0: 1 on a CPU, the micro-batch on a GPU).
+        lora_r: rank of a new LoRA adapter; 0 trains all weights.
+        lora_alpha: scale of the adapter (0: twice the rank).
+        lora_targets: module names that carry LoRA (``all-linear`` or a list).
+        eval_specs: agent specs to evaluate under after training: mappings or paths.
+        eval_sampling: sampling overrides at evaluation (default: greedy).
+        plots: write the reward curve as PNG when training ends.
+    """
+
+    model: str = field(default="smollm2-135m", metadata={"help": "folder, bundled name or hub id"})
+    adapter: str = field(default="", metadata={"help": "PEFT folder to start from"})
+    agent: dict[str, Any] | str | None = field(default=None, metadata={"help": "agent spec: mapping or YAML path"})
+    env: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the environment"})
+    train_tasks: int = field(default=64, metadata={"help": "number of distinct training tasks"})
+    eval_tasks: int = field(default=16, metadata={"help": "number of held-out tasks"})
+    train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
+    train_credits: list[str] = field(default_factory=lambda: ["executed"])
+    rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
+    estimator: str = field(default="grpo", metadata={"help": "grpo, centred or rloo"})
+    env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
+    rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
+    rows_per_forward: int = field(default=0, metadata={"help": "rows per forward; 0: chosen by device"})
+    lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
+    lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
+    lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
+    eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
+    eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
+    plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})
+
+    def __post_init__(self) -> None:
+        for name in ("agent", "env", "rewards", "eval_specs", "eval_sampling"):
+            value = getattr(self, name)
+            if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
+                setattr(self, name, _json(name, value))
+        super().__post_init__()
+
+    @property
+    def spec(self) -> AgentSpec:
+        """The training scaffold."""
+        return agent_spec(self.agent)
+
+    @property
+    def train_filter(self) -> TrainFilter:
+        """Which completions are trained."""
+        return TrainFilter(tuple(self.train_calls), tuple(self.train_credits))  # type: ignore[arg-type]  # checked
+
+    @property
+    def environment(self) -> tuple[str, dict[str, Any]]:
+        """Name and options of the environment.
+
+        Raises:
+            SpecError: not of the form ``{name: ..., options: {...}}``.
+        """
+        env = self.env if self.env is not None else {"name": "deliverybench"}
+        if isinstance(env, str):
+            env = {"name": env}
+        if not isinstance(env.get("name"), str) or set(env) - {"name", "options"}:
+            raise SpecError(f"env: expected {{name: ..., options: {{...}}}}, got {env!r}")
+        return env["name"], dict(env.get("options") or {})
+
+    @property
+    def reward_set(self) -> RewardSet:
+        """The weighted rewards."""
+        if isinstance(self.rewards, str):
+            return RewardSet({self.rewards: 1.0})
+        return RewardSet(self.rewards)
+
+    def check(self) -> None:
+        """Refuse what cannot work or would not be exact.
+
+        Raises:
+            SpecError: what was given, why it cannot work, what to do.
+        """
+        spec = self.spec
+        _ = self.reward_set, self.environment
+        if self.estimator not in ESTIMATORS:
+            raise SpecError(f"unknown estimator {self.estimator!r}{suggest(self.estimator, ESTIMATORS)}")
+        for credit in self.train_credits:
+            if credit not in ("executed", "explored", "aux"):
+                raise SpecError(f"unknown credit {credit!r}; known: executed, explored, aux")
+        missing = unmatched_patterns(call_paths(spec), self.train_filter)
+        if missing:
+            raise SpecError(
+                f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
+                f"come from {', '.join(sorted(set(call_paths(spec))))}"
+            )
+        if spec.sampling.temperature <= 0:
+            raise SpecError("agent.sampling.temperature is 0: greedy choices have no gradient; set it above 0")
+        if spec.sampling.top_p < 1 or spec.sampling.top_k > 0:
+            raise SpecError(
+                "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full "
+                "distribution and would not match the sampled ones; train with top_p 1 and top_k 0"
+            )
+        if self.loss_type in REFUSED_LOSSES:
+            raise SpecError(
+                f"loss_type {self.loss_type!r} is not offered: {REFUSED_LOSSES[self.loss_type]}; "
+                f"use one of {', '.join((*EXACT_LOSSES, *ROW_LOSSES))}"
+            )
+        for name, wanted in (
+            ("mask_truncated_completions", False),
+            ("multi_objective_aggregation", "sum_then_normalize"),
+            ("importance_sampling_level", "token"),
+            ("scale_rewards", "group"),
+        ):
+            if getattr(self, name) != wanted:
+                raise SpecError(
+                    f"{name}={getattr(self, name)!r} speaks of rows, not of episodes, and is not offered; leave it at "
+                    f"{wanted!r} (advantages are chosen by `estimator`)"
+                )
+        if self.num_generations < 2:
+            raise SpecError(f"num_generations is {self.num_generations}: a group needs at least 2 rollouts to compare")
+
+    def warnings(self) -> list[str]:
+        """What a user should know about a configuration that runs."""
+        notes = []
+        if self.loss_type in ROW_LOSSES:
+            notes.append(f"loss_type {self.loss_type}: {ROW_LOSSES[self.loss_type]}; 'dapo' does not depend on rows")
+        return notes
+
+
+def call_paths(spec: AgentSpec) -> list[str]:
+    """``module/...`` paths of the modules that may call the model, for checking patterns before a run."""
+    paths = []
+    for kind in MODULE_KINDS:
+        name = getattr(spec, kind).name
+        calls = REGISTRY.get(kind, name).calls
+        if any(most > 0 for _, most in (calls.retrieve, calls.store, calls.step, calls.episode)):
+            purposes = REGISTRY.get(kind, name).purposes or ("*",)
+            paths += [f"{kind}.{name}/{purpose}" for purpose in purposes]
+    return paths
+
+
+def agent_spec(value: Any) -> AgentSpec:
+    """A spec from a mapping, a YAML path, or nothing (all defaults)."""
+    if value is None:
+        return AgentSpec()
+    if isinstance(value, str):
+        return AgentSpec.from_yaml(value)
+    return AgentSpec.from_data(value)
+
+
+def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:
+    try:
+        data: Mapping[str, Any] | list[Any] = json.loads(text)
+    except ValueError as error:
+        raise SpecError(f"{name}: not valid JSON ({error}); quote keys and strings with double quotes") from error
+    return data
+
+
+__all__ = ["EXACT_LOSSES", "REFUSED_LOSSES", "ROW_LOSSES", "ScaffoldConfig", "agent_spec", "call_paths", "load_yaml"]

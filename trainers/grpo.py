@@ -1,0 +1,306 @@
+"""GRPO inside the scaffold: TRL's trainer, fed by episodes.
+
+TRL keeps what it is good at: configuration, rewards and their logs, the clipped losses, PEFT, accelerate, checkpoints.
+This subclass replaces where rows come from. For each generation batch it runs one episode per task row, lets TRL see
+one stand-in row per episode so that rewards, groups and logs stay its own, and then puts all sequences of all episodes
+in their place: advantages per episode, a fixed number of micro-batches, the denominator counted over what is trained.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+from trl import GRPOTrainer
+
+from agentspec.episode import MakeEnv, Runner, make_env
+from agentspec.llm.base import LLM
+from agentspec.registry import SpecError
+from agentspec.trajectory import Trajectory
+from trainers.advantages import ESTIMATORS, zero_variance
+from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
+from trainers.config import ScaffoldConfig
+from trainers.rollouts import collect, rollout_jobs
+from trainers.runlog import RunLog
+from trainers.sequences import build_sequences
+
+ROWS = "rows"
+"""Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
+
+
+class ScaffoldGRPOTrainer(GRPOTrainer):
+    """GRPO whose rollouts are episodes of an agent.
+
+    Args:
+        model: the policy, already loaded (a ``PeftModel`` or any causal LM).
+        args: see :class:`~trainers.config.ScaffoldConfig`.
+        train_dataset: rows of :func:`~trainers.rollouts.task_rows`.
+        make_llm: model, tokenizer -> the backend that samples from the live policy (default: the local one).
+        make_env: task -> environment.
+        kwargs: passed on to ``trl.GRPOTrainer``.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        args: ScaffoldConfig,
+        *,
+        make_llm: Callable[[nn.Module, Any], LLM] | None = None,
+        make_env: MakeEnv = make_env,
+        **kwargs: Any,
+    ) -> None:
+        args.check()
+        self.rewards_used = args.reward_set
+        self._episodes: list[Trajectory] = []
+        super().__init__(
+            model=model,
+            args=args,
+            reward_funcs=[self._reward_function(name) for name in self.rewards_used.weights],
+            **kwargs,
+        )
+        self.reward_weights = torch.tensor(list(self.rewards_used.weights.values()), dtype=torch.float32)
+        self.run_log = RunLog(args.output_dir)
+        self._make_env = make_env
+        self._make_llm = make_llm or local_llm
+        self._llm: LLM | None = None
+        self._round = 0
+
+    # --- rollouts ----------------------------------------------------------------------------------------------------
+
+    @property
+    def llm(self) -> LLM:
+        """The backend that samples from the live policy."""
+        if self._llm is None:
+            self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
+        return self._llm
+
+    def _reward_function(self, name: str) -> Callable[..., list[float | None]]:
+        """A TRL reward function that reads the finished episodes."""
+
+        def reward(**_: Any) -> list[float | None]:
+            terms = [self.rewards_used.terms(t) for t in self._episodes]
+            return [None if t is None else t[name] for t in terms]
+
+        reward.__name__ = name
+        return reward
+
+    def _generate(self, prompts: list[Any]) -> tuple[Any, ...]:
+        """One stand-in row per episode for TRL; the episodes themselves are kept aside.
+
+        Returns TRL's tuple: prompt ids, completion ids, tool mask, completions, log-probs, extra fields, images, tool
+        images.
+        """
+        rows, mode = self._task_rows, "train" if self.model.training else "eval"
+        group = self.num_generations if mode == "train" else self.num_generations_eval
+        jobs = rollout_jobs(
+            rows,
+            seed=self.args.seed,
+            round=self._round,
+            first=self.accelerator.process_index * len(rows),
+            group=group,
+        )
+        runner = Runner(
+            self.args.spec,
+            self.llm,
+            make_env=self._make_env,
+            concurrency=self.args.rollout_concurrency or None,
+            timeout_s=self.args.env_timeout_s,
+            policy=f"step-{self.state.global_step}",
+        )
+        invalidate = getattr(self.llm, "invalidate", None)
+        if invalidate is not None:
+            invalidate()
+        self._episodes = collect(runner, jobs)
+        self._log_episodes(mode)
+        stand_in = [self._tokenizer.pad_token_id]
+        completions = [[{"role": "assistant", "content": _transcript(t)}] for t in self._episodes]
+        n = len(self._episodes)
+        return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
+
+    def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
+        self._task_rows = inputs
+        mode = "train" if self.model.training else "eval"
+        super()._generate_and_score_completions(inputs)  # rewards, their logs, and TRL's metrics
+        rows = self._rows(mode)
+        return {ROWS: rows}
+
+    def _rows(self, mode: str) -> list[Row]:
+        """All sequences of this rank's episodes with the advantages of the whole group."""
+        group = self.num_generations if mode == "train" else self.num_generations_eval
+        totals = [self.rewards_used.total(t) for t in self._episodes]
+        local = torch.tensor([math.nan if r is None else r for r in totals], device=self.accelerator.device)
+        returns = self.accelerator.gather(local).view(-1, group)
+        advantages = ESTIMATORS[self.args.estimator](returns).flatten()
+        first = self.accelerator.process_index * len(self._episodes)
+        rows: list[Row] = []
+        silent_episodes = 0
+        for i, trajectory in enumerate(self._episodes):
+            if not trajectory.scorable:
+                continue  # counts in no baseline (NaN above) and in no denominator (no rows)
+            sequences = build_sequences(trajectory, self.args.train_filter)
+            silent_episodes += not sequences
+            rows += [Row(s, advantages[first + i].item(), i) for s in sequences]
+        self._metrics[mode]["groups/zero_variance"].append(zero_variance(returns).float().mean().item())
+        self._metrics[mode]["rollouts/unscorable"].append(returns.isnan().float().mean().item())
+        self._metrics[mode]["rollouts/rows_per_episode"].append(len(rows) / max(1, len(self._episodes)))
+        self._metrics[mode]["rollouts/trained_tokens"].append(float(sum(r.sequence.trained for r in rows)))
+        if mode == "train" and silent_episodes == len(self._episodes):
+            raise SpecError(
+                f"no call of this generation batch matched train_calls {self.args.train_calls} with credits "
+                f"{self.args.train_credits}; the scaffold called {sorted(_paths(self._episodes))}"
+            )
+        return rows
+
+    # --- updates -----------------------------------------------------------------------------------------------------
+
+    def _prepare_inputs(self, generation_batch: Any) -> dict[str, Any]:
+        """The next micro-batch; a new generation round when the buffered ones are used up."""
+        if not self.model.training:
+            rows = self._generate_and_score_completions(generation_batch)[ROWS]
+            return self._micro_batches(rows, 1)[0]
+        rounds = self.args.steps_per_generation * self.num_iterations
+        if self._step % rounds == 0 or self._buffered_inputs is None:
+            self._round = self.state.global_step
+            rows = self._generate_and_score_completions(generation_batch)[ROWS]
+            self._buffered_inputs = self._micro_batches(rows, self.args.steps_per_generation)
+            self._log_update(rows)
+        batch: dict[str, Any] = self._buffered_inputs[self._step % self.args.steps_per_generation]
+        return batch
+
+    @property
+    def _skip_silent(self) -> bool:
+        """Rows with advantage 0 have no gradient unless a KL or entropy term gives them one."""
+        return self.beta == 0.0 and not self._entropy_bonus_enabled
+
+    def _micro_batches(self, rows: Sequence[Row], count: int) -> list[dict[str, Any]]:
+        """Deal rows into ``count`` micro-batches; every rank gets the same shape of deal."""
+        device = self.accelerator.device
+        sizes = self.accelerator.gather(torch.tensor([-(-max(1, len(rows)) // count)], device=device))
+        trained = torch.tensor(sum(r.sequence.trained for r in rows), device=device)
+        total = self.accelerator.gather(trained).sum()
+        pad = self._tokenizer.pad_token_id
+        hands = deal(rows, count, blank=blank_row(pad), rows_per_hand=int(sizes.max()))
+        batches = []
+        for hand in hands:
+            batch: dict[str, Any] = collate(hand, pad, device, skip_silent=self._skip_silent)
+            batch |= {ROWS: hand, "num_items_in_batch": total}
+            if self._off_policy:
+                batch["old_per_token_logps"] = batch["sampled_logprobs"]
+            if self.beta != 0.0:
+                batch["ref_per_token_logps"] = self._reference_logprobs(hand)
+            batches.append(batch)
+        return batches
+
+    @property
+    def _off_policy(self) -> bool:
+        """Whether an update may see weights other than those that sampled (then the recorded log-probs are the old)."""
+        rounds = self.args.steps_per_generation * self.num_iterations
+        return bool(self.args.gradient_accumulation_steps % rounds != 0)
+
+    def _reference_logprobs(self, rows: Sequence[Row]) -> torch.Tensor:
+        """Log-probabilities under the reference: a model of its own, or the base under the adapter."""
+        with torch.no_grad():
+            if self.ref_model is not None:
+                return rows_logprobs(self.ref_model, rows, rows_per_forward=self._rows_per_forward)[0]
+            model = self.accelerator.unwrap_model(self.model)
+            from trl.trainer.utils import use_adapter
+
+            with use_adapter(model, adapter_name="ref" if "ref" in model.peft_config else None):
+                return rows_logprobs(model, rows, rows_per_forward=self._rows_per_forward)[0]
+
+    @property
+    def _rows_per_forward(self) -> int:
+        if self.args.rows_per_forward:
+            return int(self.args.rows_per_forward)
+        return 1 if self.accelerator.device.type == "cpu" else self.args.per_device_train_batch_size
+
+    def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
+        self._current = inputs
+        try:
+            loss: torch.Tensor = super()._compute_loss(model, inputs)
+            return loss
+        finally:
+            self._current = None
+
+    def _get_per_token_logps_and_entropies(self, model: nn.Module, *args: Any, **kwargs: Any) -> Any:
+        """Log-probabilities of the micro-batch's rows under the distributions they were sampled from.
+
+        TRL also calls this for its stand-in rows, which have none of ours: those go to TRL's own implementation.
+        """
+        inputs = getattr(self, "_current", None)
+        if inputs is None:
+            return super()._get_per_token_logps_and_entropies(model, *args, **kwargs)
+        with self.accelerator.autocast():
+            logps, entropies = rows_logprobs(
+                model, inputs[ROWS], skip_silent=self._skip_silent, rows_per_forward=self._rows_per_forward
+            )
+        mode = "train" if self.model.training else "eval"
+        difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * inputs["tool_mask"]
+        self._metrics[mode]["sampling/logp_difference_max"].append(difference.max().item())
+        return logps, entropies, None
+
+    # --- logs --------------------------------------------------------------------------------------------------------
+
+    def _log_episodes(self, mode: str) -> None:
+        """Scaffold metrics of this rank's episodes, and the trajectories themselves."""
+        scored = [t for t in self._episodes if t.scorable]
+        for name in ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries"):
+            values = [float(t.metrics[name]) for t in scored if name in t.metrics]
+            if values:
+                self._metrics[mode][f"episode/{name}"].append(sum(values) / len(values))
+        if mode == "train":
+            self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
+
+    def _log_update(self, rows: Sequence[Row]) -> None:
+        """The receipt of a generation round (main process)."""
+        if not self.accelerator.is_main_process:
+            return
+        totals = [self.rewards_used.total(t) for t in self._episodes]
+        self.run_log.append(
+            "updates.jsonl",
+            {
+                "round": self._round,
+                "episodes": [t.episode for t in self._episodes],
+                "returns": totals,
+                "unscorable": [t.episode for t in self._episodes if not t.scorable],
+                "rows": [
+                    {
+                        "episode": r.episode,
+                        "tokens": len(r.sequence),
+                        "trained": r.sequence.trained,
+                        "advantage": r.advantage,
+                    }
+                    for r in rows
+                ],
+                "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
+                "estimator": self.args.estimator,
+                "loss_type": self.loss_type,
+            },
+        )
+
+    def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
+        super().log(logs, start_time)
+        if self.accelerator.is_main_process and self.model.training:
+            self.run_log.append("metrics.jsonl", {"step": self.state.global_step, **logs})
+
+
+def local_llm(model: nn.Module, tokenizer: Any) -> LLM:
+    """The local backend over the live policy."""
+    from agentspec.llm.local import LocalLLM
+
+    return LocalLLM(model, tokenizer, name="policy")
+
+
+def _paths(trajectories: Sequence[Trajectory]) -> Counter[str]:
+    return Counter(f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions)
+
+
+def _transcript(trajectory: Trajectory) -> str:
+    """What the agent did, for TRL's completion logs."""
+    if not trajectory.scorable:
+        return f"[failed] {trajectory.error}"
+    return "\n".join(t.action_text for t in trajectory.transitions)

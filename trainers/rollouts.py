@@ -1,0 +1,64 @@
+"""G rollouts of each task, run through the agent, all at once.
+
+The trainer hands over its generation batch (task rows, each repeated G times by TRL's sampler); what comes back is one
+:class:`~agentspec.trajectory.Trajectory` per row, in order. A rollout that failed is among them, marked unscorable.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from agentspec.episode import Job, Runner
+from agentspec.llm.recorder import derive_seed
+from agentspec.trajectory import Trajectory
+from agentspec.types import Task
+
+TEST_SEEDS = 20_000
+"""Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
+
+
+def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "train", first: int = 0) -> list[Task]:
+    """``count`` tasks of one environment with consecutive seeds.
+
+    Raises:
+        ValueError: training seeds that reach into the held-out range.
+    """
+    base = {"train": 0, "validation": 10_000, "test": TEST_SEEDS}[split] + first
+    if split == "train" and base + count > 10_000:
+        raise ValueError(f"training seeds {base}..{base + count - 1} reach the held-out range; use fewer than 10,000")
+    return [Task(env, base + i, options, split) for i in range(count)]
+
+
+def task_rows(tasks: Sequence[Task]) -> list[dict[str, Any]]:
+    """Dataset rows for TRL: a prompt for its logs, and the task as JSON."""
+    return [
+        {"prompt": [{"role": "user", "content": f"{t.env} seed {t.seed}"}], "task": json.dumps(asdict(t))}
+        for t in tasks
+    ]
+
+
+def task_of(row: dict[str, Any]) -> Task:
+    """The task of a dataset row."""
+    return Task(**json.loads(row["task"]))
+
+
+def rollout_jobs(rows: Sequence[dict[str, Any]], *, seed: int, round: int, first: int = 0, group: int = 1) -> list[Job]:
+    """One job per row.
+
+    Args:
+        rows: this rank's part of the generation batch.
+        seed: seed of the run.
+        round: number of the generation round; another round samples anew.
+        first: global index of the first row, so that rollouts of a group that spans ranks differ.
+        group: rollouts per task.
+    """
+    run_seed = derive_seed(seed, round)
+    return [Job(task_of(row), (first + i) % group, run_seed) for i, row in enumerate(rows)]
+
+
+def collect(runner: Runner, jobs: Sequence[Job]) -> list[Trajectory]:
+    """Run the jobs; every failure is a trajectory too."""
+    return runner.run(jobs)
