@@ -102,7 +102,7 @@ def suggest(name: str, known: Any) -> str:
     """``"; did you mean A, B?"`` for the nearest known names, or the list of all when none is near."""
     names = [str(k) for k in known]
     lowered = {k.casefold(): k for k in names}
-    near = [lowered[k] for k in difflib.get_close_matches(name.casefold(), list(lowered), n=3, cutoff=0.5)]
+    near = [lowered[k] for k in difflib.get_close_matches(name.casefold(), list(lowered), n=3, cutoff=0.6)]
     if near:
         return f"; did you mean {', '.join(near)}?"
     return f"; known: {', '.join(sorted(names))}"

@@ -6,6 +6,7 @@ assistant's turn into the context and turns an exhausted budget into a flagged d
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -62,16 +63,13 @@ class Agent:
     async def learn(self, transition: Transition) -> None:
         """Tell reasoning and memory what the executed action did."""
         await self.reasoning.observe(transition)
-        try:
+        # A memory write that the budget does not allow is a no-op; the next decision is flagged.
+        with contextlib.suppress(BudgetExceededError):
             await self.memory.store(transition)
-        except BudgetExceededError:
-            pass  # a memory write that the budget does not allow is a no-op; the next decision is flagged
         self.clock.step = transition.step + 1
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """Let memory and reflection draw their conclusions."""
         for module in (self.memory, self.reflection):
-            try:
+            with contextlib.suppress(BudgetExceededError):
                 await module.end_episode(trajectory)
-            except BudgetExceededError:
-                continue

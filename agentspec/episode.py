@@ -32,7 +32,7 @@ OBJECTS_IN_INFO = ("instruction", "action_schema", "state", "metrics")
 """Entries of ``info`` that a transition does not repeat: they stand in the agent's input or in the metrics."""
 
 
-class EnvironmentFailure(RuntimeError):
+class EnvironmentFailedError(RuntimeError):
     """An environment crashed, hung or returned what no reward can be computed from."""
 
 
@@ -89,7 +89,7 @@ class EnvWorker:
         """Run ``function`` in the worker.
 
         Raises:
-            EnvironmentFailure: it raised, or took longer than the time limit (seconds).
+            EnvironmentFailedError: it raised, or took longer than the time limit (seconds).
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[T] = loop.create_future()
@@ -97,11 +97,11 @@ class EnvWorker:
         try:
             return await asyncio.wait_for(future, self.timeout)
         except TimeoutError:
-            raise EnvironmentFailure(f"{what} took longer than {self.timeout} s") from None
+            raise EnvironmentFailedError(f"{what} took longer than {self.timeout} s") from None
         except SpecError:
             raise
         except Exception as error:
-            raise EnvironmentFailure(f"{what} raised {type(error).__name__}: {error}") from error
+            raise EnvironmentFailedError(f"{what} raised {type(error).__name__}: {error}") from error
 
     def close(self) -> None:
         """Let the thread end after what it is doing."""
@@ -218,7 +218,7 @@ class Runner:
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)
-        except (EnvironmentFailure, LLMError) as caught:
+        except (EnvironmentFailedError, LLMError) as caught:
             status, error, ended = "failed", str(caught), "failure"
         finally:
             if env is not None and status == "completed":
@@ -268,7 +268,7 @@ async def _step(
     text = decision.action.text
     observation, reward, terminated, truncated, info = await worker.call("step", lambda: env.step(text))
     if not math.isfinite(float(reward)):
-        raise EnvironmentFailure(f"step returned reward {reward} for action {text!r}; rewards must be finite")
+        raise EnvironmentFailedError(f"step returned reward {reward} for action {text!r}; rewards must be finite")
     transition = Transition(
         step=agent.clock.step,
         input=agent_input,
@@ -323,4 +323,4 @@ class NoLLM:
         return None
 
 
-__all__ = ["EnvWorker", "EnvironmentFailure", "Job", "NoLLM", "Runner", "environment_id", "make_env"]
+__all__ = ["EnvWorker", "EnvironmentFailedError", "Job", "NoLLM", "Runner", "environment_id", "make_env"]

@@ -1,7 +1,7 @@
 """Log-probabilities of sampled tokens under the distribution they were sampled from.
 
-A token sampled freely at temperature T has the log-softmax of ``logits / T``; a token sampled under a constraint has the
-log-softmax over the ids the constraint left. These are the numbers the rollout recorded, so recomputing them with
+A token sampled freely at temperature T has the log-softmax of ``logits / T``; a token sampled under a constraint has
+the log-softmax over the ids the constraint left. These are the numbers the rollout recorded, so recomputing them with
 unchanged weights gives the same values, and their gradient is the policy gradient of the policy that acted.
 """
 

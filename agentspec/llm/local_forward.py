@@ -127,24 +127,19 @@ class PackedModel:
     def session(self) -> Iterator[None]:
         """Evaluation mode, no gradients, our attention; everything as before at the end."""
         _register()
-        training, configs = [], {}
+        configs = {}
         for module in self.model.modules():
-            if module.training:
-                training.append(module)
-                module.training = False
             config = getattr(module, "config", None)
             if hasattr(config, "_attn_implementation_internal"):
-                configs.setdefault(id(config), (config, config._attn_implementation_internal))
-        try:
-            for config, _ in configs.values():
-                config._attn_implementation_internal = _ATTENTION
-            with torch.no_grad():
+                configs[id(config)] = (config, config._attn_implementation_internal)
+        with _evaluating(self.model):
+            try:
+                for config, _ in configs.values():
+                    config._attn_implementation_internal = _ATTENTION
                 yield
-        finally:
-            for config, implementation in configs.values():
-                config._attn_implementation_internal = implementation
-            for module in training:
-                module.training = True
+            finally:
+                for config, implementation in configs.values():
+                    config._attn_implementation_internal = implementation
 
     def check(self) -> None:
         """Compare the packed forward with the model's own on a few tokens, once.
@@ -165,19 +160,14 @@ class PackedModel:
                     [Segment(slots[0], tokens[5:], 5), Segment(slots[1], tokens[8:], 8, source=slots[0])]
                 ),
             ]
-        configured = self.model.training
-        self.model.eval()
-        try:
-            with torch.no_grad():
-                ids = torch.tensor([tokens], device=self.device)
-                plain = self.model(input_ids=ids, use_cache=False).logits[0].float()
-        finally:
-            self.model.train(configured)
+        with _evaluating(self.model):
+            plain = self.model(input_ids=torch.tensor([tokens], device=self.device), use_cache=False).logits[0].float()
         expected = torch.stack([plain[4], plain[11], plain[11]])
         got = torch.cat([packed[0][0], *packed[1]])
         scale = (expected - expected.mean(-1, keepdim=True)).norm()
         error = float((got - expected).norm() / scale)
-        limit = 1e-3 if plain.dtype == torch.float32 and self._dtype() == torch.float32 else 0.1
+        exact = next(self.model.parameters()).dtype == torch.float32
+        limit = 1e-3 if exact else 0.1
         if not error <= limit:
             raise LLMError(
                 f"the local backend does not compute {type(self.model).__name__} ({self.config.model_type}) correctly: its "
@@ -186,8 +176,19 @@ class PackedModel:
             )
         self._checked = True
 
-    def _dtype(self) -> torch.dtype:
-        return next(self.model.parameters()).dtype
+
+@contextmanager
+def _evaluating(model: Any) -> Iterator[None]:
+    """No gradients, and every module in evaluation mode (which also turns gradient checkpointing off)."""
+    training = [m for m in model.modules() if m.training]
+    for module in training:
+        module.training = False
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def _register() -> None:

@@ -10,6 +10,8 @@ In the ``conversation`` layout the transcript is the context itself; in ``snapsh
 
 from __future__ import annotations
 
+import re
+
 from agentspec.actions import parse_action
 from agentspec.protocols import Services
 from agentspec.reasoning.common import ask_action, default_answer, last_action_line, sampled, static_prompt, user_turn
@@ -94,7 +96,7 @@ class ReAct:
         )
 
     async def observe(self, transition: Transition) -> None:
-        thought = " ".join(transition.decision.rationale.split())
+        thought = _thought(transition.decision.rationale)
         result = transition.info.get("error") or transition.info.get("message") or "done"
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
 
@@ -103,3 +105,9 @@ class ReAct:
 
     def restore(self, blob: bytes) -> None:
         self._transcript = load_state(blob)
+
+
+def _thought(rationale: str) -> str:
+    """The thought alone, on one line: without its label and without the action that follows it."""
+    thought = re.split(r"\baction\s*:", rationale, maxsplit=1, flags=re.IGNORECASE)[0]
+    return " ".join(re.sub(r"^\s*thought\s*:", "", thought, flags=re.IGNORECASE).split())

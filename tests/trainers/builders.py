@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action as Act
+from collections.abc import Sequence
+
 from agentspec.types import (
     ActionSchema,
     AgentInput,
@@ -43,7 +45,7 @@ def call(
     )
 
 
-def episode(calls: list[LLMCall], rewards: list[float] = [0.0], *, status: str = "completed", rollout: int = 0):
+def episode(calls: list[LLMCall], rewards: Sequence[float] = (0.0,), *, status: str = "completed", rollout: int = 0):
     balance, transitions = 100.0, []
     for i, reward in enumerate(rewards):
         before = balance

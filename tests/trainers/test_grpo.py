@@ -171,10 +171,9 @@ def uneven_episodes() -> list[Trajectory]:
     for i, (rows, value) in enumerate(zip([3, 1, 1, 2, 1, 2, 1, 2], RETURNS, strict=True)):
         calls = []
         for r in range(rows):
-            calls += [
-                call(len(calls) + j, [r, *c.prompt_ids], list(c.completions[0].token_ids), temperature=0.7 + 0.3 * r)
-                for j, c in enumerate(random_calls(100 * i + r, 1))
-            ]
+            (c,) = random_calls(100 * i + r, 1)
+            ids, answer = [r, *c.prompt_ids], list(c.completions[0].token_ids)
+            calls.append(call(len(calls), ids, answer, temperature=0.7 + 0.3 * r))
         episodes.append(episode(calls, [value], rollout=i % 4))
     return episodes
 

@@ -38,7 +38,7 @@ class Refused(Exception):
         self.silent = silent
 
 
-def _spec(name: str, description: str, example: str, **parameters: Parameter) -> ActionSpec:
+def _spec(name: str, description: str, example: str, /, **parameters: Parameter) -> ActionSpec:
     return ActionSpec(name, description, parameters, example)
 
 

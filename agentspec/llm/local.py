@@ -1,0 +1,193 @@
+"""The local backend: a live transformers model, possibly the very one under training.
+
+:class:`LocalLLM` turns requests into token rows (:mod:`agentspec.llm.chat`), gathers those of all live episodes into one
+batch (:mod:`agentspec.llm.batching`) and runs it without padding on cached prefixes (:mod:`agentspec.llm.local_engine`). The
+model is never moved, cast or left changed, so a trainer can hand over the model it optimises; its weights may change
+between batches (the caches notice in-place updates; call :meth:`LocalLLM.invalidate` after any other change).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from os import PathLike
+from typing import Any
+
+from agentspec.llm.base import LLMError, Message, Request, require_context
+from agentspec.llm.batching import Batcher
+from agentspec.llm.chat import ChatFormat
+from agentspec.llm.constrain import ChoiceTrie
+from agentspec.llm.local_engine import Engine
+from agentspec.llm.local_forward import PackedModel
+from agentspec.llm.local_rows import Job
+from agentspec.llm.models import resolve
+from agentspec.types import LLMCall, Sampling, Usage
+
+
+class LocalLLM:
+    """An :class:`~agentspec.llm.base.LLM` over a transformers causal language model (or a PEFT model around one).
+
+    Args:
+        model: the model; used where it is and as it is.
+        tokenizer: its Hugging Face tokenizer.
+        name: model name in the records.
+        max_batch: samples that run at once.
+        max_cache_tokens: token positions kept in the prefix cache; one costs
+            ``2 * layers * key_value_heads * head_size`` numbers.
+        max_context: context window; by default the model's.
+        template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
+        patience_s: see :class:`~agentspec.llm.batching.Batcher`.
+
+    Raises:
+        LLMError: the architecture cannot run in this backend (checked again, numerically, before the first batch).
+    """
+
+    capabilities = frozenset({"token_ids", "logprobs", "choices", "score", "n"})
+
+    def __init__(
+        self,
+        model: Any,
+        tokenizer: Any,
+        *,
+        name: str,
+        max_batch: int = 64,
+        max_cache_tokens: int = 32768,
+        max_context: int | None = None,
+        template_kwargs: Mapping[str, Any] | None = None,
+        patience_s: float = 60.0,
+    ) -> None:
+        self.name = name
+        self.model = model
+        self.tokenizer = tokenizer
+        self.chat = ChatFormat(tokenizer, template_kwargs)
+        packed = PackedModel(model)
+        self.max_context = max_context or packed.max_context
+        self.stop_ids = self.chat.stop_ids | _eos_ids(model)
+        self._engine = Engine(
+            packed,
+            stop_ids=self.stop_ids,
+            decode=self._decode,
+            max_batch=max_batch,
+            max_cache_tokens=max_cache_tokens,
+        )
+        self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s)
+        self._trie = lru_cache(maxsize=512)(self._make_trie)
+
+    @classmethod
+    def load(
+        cls,
+        name_or_path: str | PathLike[str],
+        adapter: str | PathLike[str] | None = None,
+        *,
+        dtype: str = "auto",
+        device: str = "auto",
+        name: str | None = None,
+        **kwargs: Any,
+    ) -> LocalLLM:
+        """Load a model by folder, bundled name or hub id (see :func:`~agentspec.llm.models.resolve`).
+
+        Args:
+            name_or_path: which model.
+            adapter: a PEFT adapter folder to put on it.
+            dtype: ``"auto"`` (as stored), ``"float32"``, ``"bfloat16"`` or ``"float16"``.
+            device: ``"auto"`` (the first accelerator, else the CPU) or a torch device.
+            name: model name in the records; by default the one it was found by.
+            kwargs: as of :class:`LocalLLM`.
+
+        Raises:
+            ModelNotFoundError: no such model or adapter.
+            LLMError: its files cannot be loaded.
+        """
+        import torch
+        from transformers import AutoModelForCausalLM, AutoTokenizer
+
+        source = resolve(name_or_path, adapter)
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(source.path)
+            model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
+            if source.adapter:
+                from peft import PeftModel
+
+                model = PeftModel.from_pretrained(model, source.adapter)
+            model = model.to(device).eval()
+        except (OSError, ValueError, RuntimeError) as error:
+            raise LLMError(
+                f"the model {source.path} (adapter: {source.adapter}) cannot be loaded: {error}; check that the folder is "
+                "complete and was written by `save_pretrained`, and that the device has room for it"
+            ) from error
+        return cls(model, tokenizer, name=name or source.name, **kwargs)
+
+    async def generate(self, request: Request) -> LLMCall:
+        """Sample ``request.sampling.n`` completions (see :class:`~agentspec.llm.base.LLM`)."""
+        began = time.perf_counter()
+        sampling = request.sampling
+        prompt = self.chat.render(request.messages)
+        trie = self._trie(sampling.choices) if sampling.choices else None
+        require_context(len(prompt), trie.longest if trie else sampling.max_tokens, self.max_context)
+        job = Job(request.tag.episode, prompt, sampling, request.seed, trie)
+        await self._batcher.submit(request.tag.episode, request.id, job)
+        usage = Usage(len(prompt), sum(len(c.token_ids) for c in job.completions), job.cached)
+        latency = time.perf_counter() - began
+        return LLMCall(request.id, request.tag, tuple(prompt), job.completions, sampling, usage, latency, self.name)
+
+    async def score(
+        self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
+    ) -> tuple[float, ...]:
+        """Log-probability of each continuation after the prompt; what they share is computed once."""
+        if not continuations:
+            return ()
+        prompt = self.chat.render(messages)
+        encoded = tuple(self.chat.encode(c) for c in continuations)
+        require_context(len(prompt), max(map(len, encoded)), self.max_context)
+        job = Job(episode, prompt, Sampling(), continuations=encoded)
+        await self._batcher.submit(episode, -1, job)
+        return job.scores
+
+    def count_tokens(self, text: str) -> int:
+        """Number of tokens of ``text``."""
+        return self.chat.count_tokens(text)
+
+    def enter(self, episode: str) -> None:
+        """An episode goes live: no batch runs until it, too, waits on the model."""
+        self._batcher.enter(episode)
+
+    def leave(self, episode: str) -> None:
+        """A live episode ended: the others no longer wait for it."""
+        self._batcher.leave(episode)
+        self._engine.cache.release(episode)
+
+    def invalidate(self) -> None:
+        """Drop all cached keys and values: the weights, or the adapter in use, changed."""
+        self._engine.cache.clear()
+
+    def _run(self, jobs: Sequence[Job]) -> None:
+        try:
+            self._engine.run(jobs)
+        except LLMError:
+            raise
+        except (RuntimeError, ValueError, TypeError, IndexError) as error:
+            raise LLMError(
+                f"the model {self.name} failed on a batch of {len(jobs)} requests: {type(error).__name__}: {error}; if it "
+                "ran out of memory, lower `max_batch` or `max_cache_tokens`"
+            ) from error
+
+    def _decode(self, ids: Sequence[int]) -> str:
+        return str(self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False))
+
+    def _make_trie(self, choices: tuple[str, ...]) -> ChoiceTrie:
+        if self.chat.end_of_turn is None:
+            raise LLMError(
+                f"the tokenizer of {self.name} has no end-of-turn token to close a choice with; set its `eos_token`"
+            )
+        return ChoiceTrie([self.chat.encode(c) for c in choices], self.chat.end_of_turn)
+
+
+def _eos_ids(model: Any) -> frozenset[int]:
+    """All end-of-sequence ids of the model's generation config."""
+    eos = getattr(getattr(model, "generation_config", None), "eos_token_id", None)
+    if eos is None:
+        return frozenset()
+    return frozenset(eos if isinstance(eos, list | tuple) else [eos])
