@@ -7,14 +7,20 @@ with rows that train nothing. So no row is ever lost and the number of optimiser
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import nn
+from torch.utils.checkpoint import checkpoint
 
+from agentspec.trajectory import shared_prefix
 from trainers.logprobs import sampled_logprobs
 from trainers.sequences import TokenSequence
+from trainers.tree import build_tree, packed_inputs, wanted_tokens
+
+Packing = Literal["tree", "padded"]
 
 
 @dataclass(frozen=True)
@@ -39,11 +45,14 @@ def blank_row(token: int) -> Row:
     return Row(sequence, 0.0, -1)
 
 
-def deal(rows: Sequence[Row], hands: int, *, blank: Row, rows_per_hand: int = 0) -> list[list[Row]]:
-    """Deal rows into ``hands`` micro-batches of equal size, balancing tokens.
+def deal(
+    rows: Sequence[Row], hands: int, *, blank: Row, rows_per_hand: int = 0, together: bool = False
+) -> list[list[Row]]:
+    """Deal rows into ``hands`` micro-batches of equal size.
 
-    Longest first, each row goes to the hand with the fewest tokens that still has room. ``rows_per_hand`` asks for more
-    room than the rows need (another rank has more).
+    Longest first, each row goes to the hand with the fewest tokens that still has room; or, with ``together``, rows
+    that share prefixes stay in one hand. ``rows_per_hand`` asks for more room than the rows need (another rank has
+    more).
 
     Raises:
         ValueError: ``rows_per_hand`` is too small.
@@ -52,11 +61,16 @@ def deal(rows: Sequence[Row], hands: int, *, blank: Row, rows_per_hand: int = 0)
     if rows_per_hand and rows_per_hand * hands < len(rows):
         raise ValueError(f"{len(rows)} rows do not fit into {hands} micro-batches of {rows_per_hand}")
     dealt: list[list[Row]] = [[] for _ in range(hands)]
-    tokens = [0] * hands
-    for row in sorted(rows, key=lambda r: -len(r.sequence)):
-        hand = min((h for h in range(hands) if len(dealt[h]) < size), key=lambda h: (tokens[h], h))
-        dealt[hand].append(row)
-        tokens[hand] += len(row.sequence)
+    if together:
+        ordered = sorted(rows, key=lambda r: r.sequence.tokens)
+        share = -(-len(rows) // hands) if rows else 0
+        dealt = [ordered[h * share : (h + 1) * share] for h in range(hands)]
+    else:
+        tokens = [0] * hands
+        for row in sorted(rows, key=lambda r: -len(r.sequence)):
+            hand = min((h for h in range(hands) if len(dealt[h]) < size), key=lambda h: (tokens[h], h))
+            dealt[hand].append(row)
+            tokens[hand] += len(row.sequence)
     return [hand + [blank] * (size - len(hand)) for hand in dealt]
 
 
@@ -103,15 +117,23 @@ def collate(
 
 
 def rows_logprobs(
-    model: nn.Module, rows: Sequence[Row], *, skip_silent: bool = False, rows_per_forward: int = 1
+    model: nn.Module,
+    rows: Sequence[Row],
+    *,
+    skip_silent: bool = False,
+    packing: Packing = "padded",
+    tokens_per_forward: int = 0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probabilities and entropies of all trained tokens of a micro-batch, one padded forward per chunk of rows.
+    """Log-probabilities and entropies of all trained tokens of a micro-batch.
 
     Logits are computed only where a token is trained. Untrained places hold 0.
 
     Args:
         skip_silent: leave out rows without a policy gradient (their values stay 0).
-        rows_per_forward: 1 wastes nothing on padding (a CPU's best); more fills a GPU.
+        packing: ``padded`` rows, or a prefix ``tree`` (the model must know it: :func:`trainers.tree.enable_tree`).
+        tokens_per_forward: token budget of a forward (0: no bound for a tree, one row for padded ones). If one forward
+            does not hold the micro-batch, forwards are recomputed in the backward pass, so that activations of one
+            chunk at a time are kept.
 
     Returns:
         two float32 tensors of shape (B, L-1), aligned with ``completion_ids`` of :func:`collate`.
@@ -121,34 +143,82 @@ def rows_logprobs(
     logps = torch.zeros(len(rows), length - 1, device=device)
     entropies = torch.zeros(len(rows), length - 1, device=device)
     todo = [i for i, r in enumerate(rows) if r.sequence.trained and not (skip_silent and r.silent)]
-    if rows_per_forward > 1:
-        todo.sort(key=lambda i: len(rows[i].sequence))
-    for start in range(0, len(todo), rows_per_forward):
-        chunk = todo[start : start + rows_per_forward]
-        places, logp, entropy = _forward(model, [rows[i].sequence for i in chunk], device)
-        index = (torch.tensor([chunk[r] for r, _ in places], device=device), _positions(places, device) - 1)
+    forward = _tree_forward if packing == "tree" else _padded_forward
+    chunks = list(_chunks(rows, todo, packing, tokens_per_forward))
+    recompute = packing == "tree" and len(chunks) > 1 and torch.is_grad_enabled()
+    for chunk in chunks:
+        sequences = [rows[i].sequence for i in chunk]
+        places = [(i, p) for i, s in enumerate(sequences) for p, m in enumerate(s.mask) if m]
+        if recompute:
+            logp, entropy = checkpoint(forward, model, sequences, places, device, use_reentrant=False)
+        else:
+            logp, entropy = forward(model, sequences, places, device)
+        index = (
+            torch.tensor([chunk[r] for r, _ in places], device=device),
+            torch.tensor([p - 1 for _, p in places], device=device),
+        )
         logps = logps.index_put(index, logp)
         entropies = entropies.index_put(index, entropy.detach())
     if not todo:
+        # Every rank takes part in the backward pass, with or without something to learn.
         logps = logps + 0.0 * sum(p.sum() for p in model.parameters() if p.requires_grad)
     return logps, entropies
 
 
-def _positions(places: Sequence[tuple[int, int]], device: torch.device) -> torch.Tensor:
-    return torch.tensor([p for _, p in places], device=device)
+def _chunks(rows: Sequence[Row], todo: list[int], packing: Packing, budget: int) -> Iterator[list[int]]:
+    """Rows of one forward each: within the token budget (unique tokens for a tree, padded ones otherwise)."""
+    if packing == "tree":
+        todo = sorted(todo, key=lambda i: rows[i].sequence.tokens)
+    elif budget:
+        todo = sorted(todo, key=lambda i: len(rows[i].sequence))
+    chunk: list[int] = []
+    used = 0
+    for i in todo:
+        length = len(rows[i].sequence)
+        if packing == "tree":
+            shared = shared_prefix(rows[chunk[-1]].sequence.tokens, rows[i].sequence.tokens) if chunk else 0
+            cost, full = length - shared, bool(budget) and used + length - shared > budget
+        else:
+            cost, full = length, (len(chunk) + 1) * length > budget
+        if chunk and full:
+            yield chunk
+            chunk, used, cost = [], 0, length
+        chunk.append(i)
+        used += cost
+    if chunk:
+        yield chunk
 
 
-def _forward(
-    model: nn.Module, sequences: Sequence[TokenSequence], device: torch.device
-) -> tuple[list[tuple[int, int]], torch.Tensor, torch.Tensor]:
-    """(row, position) of every trained token of a padded chunk, with log-probability and entropy."""
+def _tree_forward(
+    model: nn.Module, sequences: Sequence[TokenSequence], places: Sequence[tuple[int, int]], device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-probability and entropy of every place, from one packed forward."""
+    tokens = [s.tokens for s in sequences]
+    tree = build_tree(tokens)
+    output = model(
+        **packed_inputs(tree, device),
+        **wanted_tokens(
+            tree,
+            tokens,
+            places,
+            device,
+            temperatures=[sequences[r].temperatures[p] for r, p in places],
+            allowed=[sequences[r].allowed.get(p) for r, p in places],
+        ),
+    )
+    return output.log_probs, output.entropies
+
+
+def _padded_forward(
+    model: nn.Module, sequences: Sequence[TokenSequence], places: Sequence[tuple[int, int]], device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-probability and entropy of every place, from one padded forward."""
     length = max(len(s) for s in sequences)
     ids = torch.zeros(len(sequences), length, dtype=torch.long)
     attention = torch.zeros_like(ids)
     for i, s in enumerate(sequences):
         ids[i, : len(s)] = torch.tensor(s.tokens)
         attention[i, : len(s)] = 1
-    places = [(i, p) for i, s in enumerate(sequences) for p, m in enumerate(s.mask) if m]
     # The logits before a token decide it. Only positions that some row trains are projected on the vocabulary.
     keep = sorted({p - 1 for _, p in places})
     column = {p: k for k, p in enumerate(keep)}
@@ -163,5 +233,4 @@ def _forward(
     tokens = torch.tensor([sequences[r].tokens[p] for r, p in places], device=device)
     temperatures = torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device)
     allowed = [sequences[r].allowed.get(p) for r, p in places]
-    logp, entropy = sampled_logprobs(logits[rows, columns], tokens, temperatures, allowed)
-    return places, logp, entropy
+    return sampled_logprobs(logits[rows, columns], tokens, temperatures, allowed)

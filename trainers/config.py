@@ -45,7 +45,7 @@ class ScaffoldConfig(GRPOConfig):
         model: what :func:`agentspec.llm.models.resolve` understands: a folder, ``smollm2-135m`` or a hub id.
         adapter: PEFT folder to start from (a warm start), or empty.
         agent: the agent spec: a mapping, or a path to a YAML file.
-        env: ``{name: ..., options: {...}}``: the environment and its ``gymnasium.make`` arguments.
+        environment: ``{name: ..., options: {...}}``: the world and its ``gymnasium.make`` arguments.
         train_tasks: number of distinct training tasks (seeds ``0 .. train_tasks - 1``).
         eval_tasks: number of held-out tasks (seeds ``20000 ..``) for evaluation after training.
         train_calls: patterns over ``module/purpose`` of the calls that are trained.
@@ -54,19 +54,22 @@ class ScaffoldConfig(GRPOConfig):
         estimator: how returns become advantages (``grpo``, ``centred``, ``rloo``).
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        rows_per_forward: rows per forward in the update (0: 1 on a CPU, the micro-batch on a GPU).
+        packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
+        tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
+            for padded rows); chunks beyond one are recomputed backward, which bounds memory.
         lora_r: rank of a new LoRA adapter; 0 trains all weights.
         lora_alpha: scale of the adapter (0: twice the rank).
         lora_targets: module names that carry LoRA (``all-linear`` or a list).
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         plots: write the reward curve as PNG when training ends.
+        resume: continue from the last checkpoint in ``output_dir``.
     """
 
     model: str = field(default="smollm2-135m", metadata={"help": "folder, bundled name or hub id"})
     adapter: str = field(default="", metadata={"help": "PEFT folder to start from"})
     agent: dict[str, Any] | str | None = field(default=None, metadata={"help": "agent spec: mapping or YAML path"})
-    env: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the environment"})
+    environment: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the world"})
     train_tasks: int = field(default=64, metadata={"help": "number of distinct training tasks"})
     eval_tasks: int = field(default=16, metadata={"help": "number of held-out tasks"})
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
@@ -75,16 +78,18 @@ class ScaffoldConfig(GRPOConfig):
     estimator: str = field(default="grpo", metadata={"help": "grpo, centred or rloo"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    rows_per_forward: int = field(default=0, metadata={"help": "rows per forward; 0: chosen by device"})
+    packing: str = field(default="tree", metadata={"help": "tree or padded"})
+    tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
     lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
     lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
     lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})
+    resume: bool = field(default=False, metadata={"help": "continue from the last checkpoint in output_dir"})
 
     def __post_init__(self) -> None:
-        for name in ("agent", "env", "rewards", "eval_specs", "eval_sampling"):
+        for name in ("agent", "environment", "rewards", "eval_specs", "eval_sampling"):
             value = getattr(self, name)
             if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
                 setattr(self, name, _json(name, value))
@@ -101,18 +106,31 @@ class ScaffoldConfig(GRPOConfig):
         return TrainFilter(tuple(self.train_calls), tuple(self.train_credits))  # type: ignore[arg-type]  # checked
 
     @property
-    def environment(self) -> tuple[str, dict[str, Any]]:
+    def world(self) -> tuple[str, dict[str, Any]]:
         """Name and options of the environment.
 
         Raises:
             SpecError: not of the form ``{name: ..., options: {...}}``.
         """
-        env = self.env if self.env is not None else {"name": "deliverybench"}
-        if isinstance(env, str):
-            env = {"name": env}
-        if not isinstance(env.get("name"), str) or set(env) - {"name", "options"}:
-            raise SpecError(f"env: expected {{name: ..., options: {{...}}}}, got {env!r}")
-        return env["name"], dict(env.get("options") or {})
+        given = self.environment if self.environment is not None else {"name": "deliverybench"}
+        if isinstance(given, str):
+            given = {"name": given}
+        if not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
+            raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")
+        return given["name"], dict(given.get("options") or {})
+
+    @property
+    def evaluation_specs(self) -> list[Any]:
+        """Agent specs to evaluate under: the training scaffold if none are named."""
+        specs = self.eval_specs
+        if specs is None:
+            return [self.spec]
+        return [specs] if isinstance(specs, str) else list(specs)
+
+    @property
+    def evaluation_sampling(self) -> dict[str, Any]:
+        """Sampling overrides at evaluation; greedy unless the config says otherwise."""
+        return {"temperature": 0.0} if self.eval_sampling is None else dict(self.eval_sampling)  # type: ignore[arg-type]
 
     @property
     def reward_set(self) -> RewardSet:
@@ -128,9 +146,11 @@ class ScaffoldConfig(GRPOConfig):
             SpecError: what was given, why it cannot work, what to do.
         """
         spec = self.spec
-        _ = self.reward_set, self.environment
+        _ = self.reward_set, self.world
         if self.estimator not in ESTIMATORS:
             raise SpecError(f"unknown estimator {self.estimator!r}{suggest(self.estimator, ESTIMATORS)}")
+        if self.packing not in ("tree", "padded"):
+            raise SpecError(f"packing must be 'tree' or 'padded', got {self.packing!r}")
         for credit in self.train_credits:
             if credit not in ("executed", "explored", "aux"):
                 raise SpecError(f"unknown credit {credit!r}; known: executed, explored, aux")

@@ -27,6 +27,7 @@ from trainers.config import ScaffoldConfig
 from trainers.rollouts import collect, rollout_jobs
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
+from trainers.tree import enable_tree
 
 ROWS = "rows"
 """Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
@@ -63,11 +64,20 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             **kwargs,
         )
         self.reward_weights = torch.tensor(list(self.rewards_used.weights.values()), dtype=torch.float32)
+        if args.packing == "tree":
+            for policy in filter(None, (self.model, self.ref_model)):
+                enable_tree(self.accelerator.unwrap_model(policy))
+        self._packing: dict[str, Any] = {"packing": args.packing, "tokens_per_forward": args.tokens_per_forward}
         self.run_log = RunLog(args.output_dir)
         self._make_env = make_env
         self._make_llm = make_llm or local_llm
         self._llm: LLM | None = None
         self._round = 0
+
+    @property
+    def last_episodes(self) -> list[Trajectory]:
+        """This rank's episodes of the last generation round."""
+        return self._episodes
 
     # --- rollouts ----------------------------------------------------------------------------------------------------
 
@@ -183,7 +193,8 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         trained = torch.tensor(sum(r.sequence.trained for r in rows), device=device)
         total = self.accelerator.gather(trained).sum()
         pad = self._tokenizer.pad_token_id
-        hands = deal(rows, count, blank=blank_row(pad), rows_per_hand=int(sizes.max()))
+        together = self.args.packing == "tree"
+        hands = deal(rows, count, blank=blank_row(pad), rows_per_hand=int(sizes.max()), together=together)
         batches = []
         for hand in hands:
             batch: dict[str, Any] = collate(hand, pad, device, skip_silent=self._skip_silent)
@@ -205,18 +216,12 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         """Log-probabilities under the reference: a model of its own, or the base under the adapter."""
         with torch.no_grad():
             if self.ref_model is not None:
-                return rows_logprobs(self.ref_model, rows, rows_per_forward=self._rows_per_forward)[0]
+                return rows_logprobs(self.ref_model, rows, **self._packing)[0]
             model = self.accelerator.unwrap_model(self.model)
             from trl.trainer.utils import use_adapter
 
             with use_adapter(model, adapter_name="ref" if "ref" in model.peft_config else None):
-                return rows_logprobs(model, rows, rows_per_forward=self._rows_per_forward)[0]
-
-    @property
-    def _rows_per_forward(self) -> int:
-        if self.args.rows_per_forward:
-            return int(self.args.rows_per_forward)
-        return 1 if self.accelerator.device.type == "cpu" else self.args.per_device_train_batch_size
+                return rows_logprobs(model, rows, **self._packing)[0]
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
         self._current = inputs
@@ -235,9 +240,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         if inputs is None:
             return super()._get_per_token_logps_and_entropies(model, *args, **kwargs)
         with self.accelerator.autocast():
-            logps, entropies = rows_logprobs(
-                model, inputs[ROWS], skip_silent=self._skip_silent, rows_per_forward=self._rows_per_forward
-            )
+            logps, entropies = rows_logprobs(model, inputs[ROWS], skip_silent=self._skip_silent, **self._packing)
         mode = "train" if self.model.training else "eval"
         difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * inputs["tool_mask"]
         self._metrics[mode]["sampling/logp_difference_max"].append(difference.max().item())

@@ -1,13 +1,14 @@
 """When to run a batch: once every live episode waits on the model.
 
-Episodes run as asyncio tasks. Each thinks, acts and asks the model at its own pace; a batch is worth most when nobody is
-left who could still join it. So requests gather until every live episode has at least one pending; the loop is then given a
-few turns, so that an episode that asks several things at once is complete, and the requests run as one batch, ordered by
-episode and request id, in a worker thread while the loop goes on. Membership, and so the batch, does not depend on timing.
+Episodes run as asyncio tasks. Each thinks, acts and asks the model at its own pace; a batch is worth most when nobody
+is left who could still join it. So requests gather until every live episode has at least one pending; the loop is
+then given a few turns, so that an episode that asks several things at once is complete, and the requests run as one
+batch, ordered by episode and request id, in a worker thread while the loop goes on. Membership, and so the batch,
+does not depend on timing.
 
-An episode leaves when it ends; one that fails or is cancelled without saying so leaves when the task that entered it ends.
-Requests without an episode, or from an episode that never entered, wait for nobody. As a last resort, for episodes that wait
-on each other, a batch runs when nothing new has come for ``patience_s``.
+An episode leaves when it ends; one that fails or is cancelled without saying so leaves when the task that entered it
+ends. Requests without an episode, or from an episode that never entered, wait for nobody. As a last resort, for
+episodes that wait on each other, a batch runs when nothing new has come for ``patience_s``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -58,8 +60,7 @@ class Batcher(Generic[T]):
             return
         self._adopt_loop()
         if task is not None:
-            entered = self._live
-            task.add_done_callback(lambda _: self._live is entered and self.leave(episode, every=True))
+            task.add_done_callback(partial(self._task_ended, episode, self._live))
 
     def leave(self, episode: str, *, every: bool = False) -> None:
         """The episode ended (``every``: however often it entered); unknown episodes are ignored."""
@@ -86,6 +87,10 @@ class Batcher(Generic[T]):
             if pending in self._pending:
                 self._pending.remove(pending)
                 self._wake()
+
+    def _task_ended(self, episode: str, live: dict[str, int], _: object) -> None:
+        if self._live is live:
+            self.leave(episode, every=True)
 
     def _adopt_loop(self) -> None:
         """Forget what belonged to an event loop that is gone."""
@@ -145,7 +150,7 @@ class Batcher(Generic[T]):
         finally:
             self._running = False
             # What asked meanwhile, and those that were waiting for nobody else.
-            self._loop and self._loop.call_soon(self._again)
+            asyncio.get_running_loop().call_soon(self._again)
 
     def _again(self) -> None:
         self._flusher = None

@@ -13,10 +13,10 @@ Rules:
   generation prompt, followed by the parts of the turn.
 - A turn whose first part was sampled keeps the whole generation prompt it was sampled after, even where the template
   writes a shorter header for past turns (an empty think block, for example).
-- Hence appending turns extends the earlier prompt and completion exactly, for every template that writes the turns before
-  in the same way again. One that rewrites them gives a prompt that is no extension; nothing else breaks.
-- Special tokens in literal content (``<|im_end|>`` in what an environment says) are spelled out as ordinary text: content
-  cannot end a turn or open another.
+- Hence appending turns extends the earlier prompt and completion exactly, for every template that writes the turns
+  before in the same way again. One that rewrites them gives a prompt that is no extension; nothing else breaks.
+- Special tokens in literal content (``<|im_end|>`` in what an environment says) are spelled out as ordinary text:
+  content cannot end a turn or open another.
 - A template that refuses system turns gets the system text in front of the first user turn.
 - A tokenizer without a chat template gets :data:`FALLBACK_TEMPLATE`.
 """
@@ -38,7 +38,8 @@ FALLBACK_TEMPLATE = (
     "{% endfor %}"
     "{% if add_generation_prompt %}{{ '### Assistant\n' }}{% endif %}"
 )
-"""The format of a tokenizer without chat template: ``### Role``, the text, the end-of-sequence token after assistants."""
+"""The format of a tokenizer without chat template: ``### Role``, the text, the end-of-sequence token after
+assistants."""
 
 # Unicode noncharacters: never part of text, never stripped by a template.
 _BREAK = "\ufdd0"
@@ -107,11 +108,10 @@ class ChatFormat:
         pieces = _PLACEHOLDER.split(text)
         ids: list[int] = []
         literals, numbers = pieces[::2], [int(n) for n in pieces[1::2]]
-        for i, literal in enumerate(literals):
+        for i, piece in enumerate(literals):
             turn = turns[numbers[i]] if i < len(numbers) else None
-            if turn is not None and turn.content and isinstance(turn.content[0], Sampled):
-                literal += self._missing_header(literal)
-            encoded = self._encode_literal(literal)
+            is_sampled = turn is not None and turn.content and isinstance(turn.content[0], Sampled)
+            encoded = self._encode_literal(piece + self._missing_header(piece) if is_sampled else piece)
             ended = i > 0 and ids and ids[-1] in self.stop_ids and ids[-1:] == list(encoded[:1])
             ids.extend(encoded[1:] if ended else encoded)
             if turn is not None:
@@ -190,7 +190,8 @@ class ChatFormat:
         return True
 
     def _splits_exactly(self) -> bool:
-        """Whether tokenising between special tokens equals tokenising the whole text (not so for some SentencePieces)."""
+        """Whether tokenising between special tokens equals tokenising the whole text (not so for some
+        SentencePieces)."""
         turns = [("user", "Hi there.\n\n  12 é"), ("assistant", " ok"), ("user", "\nx")]
         text = self._apply([{"role": role, "content": content} for role, content in turns], generate=True)
         return self._split is not None and self._encode_literal(text) == self._tokenize(text)

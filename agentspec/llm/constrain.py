@@ -1,9 +1,9 @@
 """Constrained decoding: a token trie over the texts a completion may be.
 
-Every choice becomes the path of its tokens followed by the end-of-turn token, so that a choice may be a prefix of another
-("go", "go north"): ending the turn is then one of the allowed tokens. A walk from the root to a leaf spells one choice.
-At a node with a single child the next token is *forced*: it carries no information, has log-probability 0 under the
-constrained distribution, and a whole run of them needs no model at all.
+Every choice becomes the path of its tokens followed by the end-of-turn token, so that a choice may be a prefix of
+another ("go", "go north"): ending the turn is then one of the allowed tokens. A walk from the root to a leaf spells
+one choice. At a node with a single child the next token is *forced*: it carries no information, has log-probability 0
+under the constrained distribution, and a whole run of them needs no model at all.
 """
 
 from __future__ import annotations

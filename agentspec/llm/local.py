@@ -1,9 +1,10 @@
 """The local backend: a live transformers model, possibly the very one under training.
 
-:class:`LocalLLM` turns requests into token rows (:mod:`agentspec.llm.chat`), gathers those of all live episodes into one
-batch (:mod:`agentspec.llm.batching`) and runs it without padding on cached prefixes (:mod:`agentspec.llm.local_engine`). The
-model is never moved, cast or left changed, so a trainer can hand over the model it optimises; its weights may change
-between batches (the caches notice in-place updates; call :meth:`LocalLLM.invalidate` after any other change).
+:class:`LocalLLM` turns requests into token rows (:mod:`agentspec.llm.chat`), gathers those of all live episodes into
+one batch (:mod:`agentspec.llm.batching`) and runs it without padding on cached prefixes
+(:mod:`agentspec.llm.local_engine`). The model is never moved, cast or left changed, so a trainer can hand over the
+model it optimises; its weights may change between batches (the caches notice in-place updates; call
+:meth:`LocalLLM.invalidate` after any other change).
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class LocalLLM:
         *,
         name: str,
         max_batch: int = 64,
-        max_cache_tokens: int = 32768,
+        max_cache_tokens: int = 65536,
         max_context: int | None = None,
         template_kwargs: Mapping[str, Any] | None = None,
         patience_s: float = 60.0,
@@ -115,8 +116,8 @@ class LocalLLM:
             model = model.to(device).eval()
         except (OSError, ValueError, RuntimeError) as error:
             raise LLMError(
-                f"the model {source.path} (adapter: {source.adapter}) cannot be loaded: {error}; check that the folder is "
-                "complete and was written by `save_pretrained`, and that the device has room for it"
+                f"the model {source.path} (adapter: {source.adapter}) cannot be loaded: {error}; check that the folder "
+                "is complete and was written by `save_pretrained`, and that the device has room for it"
             ) from error
         return cls(model, tokenizer, name=name or source.name, **kwargs)
 
@@ -170,8 +171,8 @@ class LocalLLM:
             raise
         except (RuntimeError, ValueError, TypeError, IndexError) as error:
             raise LLMError(
-                f"the model {self.name} failed on a batch of {len(jobs)} requests: {type(error).__name__}: {error}; if it "
-                "ran out of memory, lower `max_batch` or `max_cache_tokens`"
+                f"the model {self.name} failed on a batch of {len(jobs)} requests: {type(error).__name__}: {error}; if "
+                "it ran out of memory, lower `max_batch` or `max_cache_tokens`"
             ) from error
 
     def _decode(self, ids: Sequence[int]) -> str:

@@ -1,11 +1,12 @@
 """Keys and values of token sequences the model has already read, found again by prefix.
 
 A :class:`Slot` holds the keys and values of one token sequence, per layer, in buffers that grow in place. The
-:class:`PrefixCache` keeps the slots of finished calls. A new prompt looks for the longest common prefix with any of them:
+:class:`PrefixCache` keeps the slots of finished calls. A new prompt looks for the longest common prefix with any of
+them:
 
 - its own episode's slot is *continued in place* when it is a prefix of the prompt, or nearly so;
-- any other slot (the same static prompt in another episode, another module's view of this episode) is *copied* up to the
-  common prefix. Copying a token costs about a hundredth of computing it.
+- any other slot (the same static prompt in another episode, another module's view of this episode) is *copied* up to
+  the common prefix. Copying a token costs about a hundredth of computing it.
 
 The least recently used slots go first when the bound on tokens is passed.
 """
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 
 _ROUND = 64
-_GROWTH = 1.5
+_GROWTH = 1.25
 
 
 class Slot:
@@ -43,7 +44,7 @@ class Slot:
         self.used = 0
 
     def reserve(self, capacity: int) -> None:
-        """Make room for ``capacity`` positions, keeping the first ``length``; grows by half at least."""
+        """Make room for ``capacity`` positions, keeping the first ``length``; grows by a quarter at least."""
         if capacity <= self.capacity:
             return
         self.capacity = _round_up(max(capacity, int(self.capacity * _GROWTH)))

@@ -1,9 +1,10 @@
-"""The loop that drives rows through the packed forward: reading and writing mixed, a bounded number of tokens at a time.
+"""The loop that drives rows through the packed forward: reading and writing mixed, a bounded number of tokens at a
+time.
 
-Rows are sorted by their tokens, so that a row shares its longest prefix with the row before it: that part is copied, not
-computed (the rollouts of one task, the samples of one request, the static text of all prompts). Each forward takes the
-rows that are writing first and fills up with tokens still to be read: on a CPU a forward of 16 single tokens costs nearly
-as much as one of 64, so writing beside another row's reading is almost free.
+Rows are sorted by their tokens, so that a row shares its longest prefix with the row before it: that part is copied,
+not computed (the rollouts of one task, the samples of one request, the static text of all prompts). Each forward
+takes the rows that are writing first and fills up with tokens still to be read: on a CPU a forward of 16 single
+tokens costs nearly as much as one of 64, so writing beside another row's reading is almost free.
 
 :meth:`Engine.run` works off one closed set of jobs. Continuous batching would admit rows between two turns of its loop.
 """
@@ -11,6 +12,7 @@ as much as one of 64, so writing beside another row's reading is almost free.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
 
@@ -78,7 +80,7 @@ class Engine:
         for row, slot in zip(rows, self.cache.assign(prompts), strict=True):
             row.slot = slot
             row.computed = row.known = slot.length
-        for before, row in zip(rows, rows[1:], strict=False):
+        for before, row in pairwise(rows):
             shared = min(_common(before.tokens, row.tokens), row.wanted)
             if shared > row.known:
                 row.source, row.computed = before, shared
@@ -91,10 +93,10 @@ class Engine:
         segments = []
         for row, n in step:
             stop = row.computed + n
-            logits = max(0, stop - max(row.wanted, row.computed))
+            wanted = max(0, stop - max(row.wanted, row.computed))
             tokens = row.tokens[row.computed : stop]
             source = row.source.slot if row.source else None
-            segments.append(Segment(row.slot, tokens, row.computed, logits, source, row.known))
+            segments.append(Segment(row.slot, tokens, row.computed, wanted, source, row.known))
         outputs = self.model.forward(segments)
         choosing: list[tuple[ChoiceRow, torch.Tensor]] = []
         writing: list[tuple[FreeRow, torch.Tensor]] = []
@@ -138,7 +140,8 @@ class Engine:
 
 def _schedule(active: Sequence[Row], budget: int) -> list[tuple[Row, int]]:
     """Which rows read how many tokens in the next forward: short rests first, then long ones in order."""
-    writing, reading = [], []
+    writing: list[tuple[Row, int]] = []
+    reading: list[tuple[Row, int]] = []
     for row in active:
         rest = len(row.tokens) - row.computed
         # A row with a source waits for it in the queue of readers, however little it has to read itself.

@@ -1,10 +1,11 @@
 """The packed forward pass: many sequences, one row of tokens, no padding.
 
-The new tokens of all sequences stand side by side in one row of shape (1, T) with their own position ids. Everything in a
-decoder except attention works on single tokens and does not notice. Attention is ours: it is registered with transformers
-as one more attention function, stores the new keys and values in the sequences' slots, and lets each segment look at its
-own slot only. So a batch of unequal prompts costs exactly its new tokens, a prefix that sequences of one batch share is
-computed once and copied, and reading a prompt, decoding and forced runs of tokens are the same operation.
+The new tokens of all sequences stand side by side in one row of shape (1, T) with their own position ids. Everything
+in a decoder except attention works on single tokens and does not notice. Attention is ours: it is registered with
+transformers as one more attention function, stores the new keys and values in the sequences' slots, and lets each
+segment look at its own slot only. So a batch of unequal prompts costs exactly its new tokens, a prefix that sequences
+of one batch share is computed once and copied, and reading a prompt, decoding and forced runs of tokens are the same
+operation.
 
 It works with every decoder that uses the attention interface of transformers, whatever its weights (float types, LoRA
 adapters); :meth:`PackedModel.check` compares it with the model's ordinary forward before its first use.
@@ -20,7 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-import torch.nn.functional as F
+from torch.nn.functional import scaled_dot_product_attention
 
 from agentspec.llm.base import LLMError
 from agentspec.llm.local_cache import Slot
@@ -92,7 +93,10 @@ class PackedModel:
         Slots are extended (``length``) by what was computed. Call inside :meth:`session`.
         """
         device = self.device
-        bounds, tokens, positions, wanted = [], [], [], []
+        bounds: list[tuple[int, int]] = []
+        tokens: list[int] = []
+        positions: list[int] = []
+        wanted: list[int] = []
         for s in segments:
             s.slot.reserve(s.start + len(s.tokens))
             begin = len(tokens)
@@ -129,7 +133,7 @@ class PackedModel:
         _register()
         configs = {}
         for module in self.model.modules():
-            config = getattr(module, "config", None)
+            config: Any = getattr(module, "config", None)
             if hasattr(config, "_attn_implementation_internal"):
                 configs[id(config)] = (config, config._attn_implementation_internal)
         with _evaluating(self.model):
@@ -156,9 +160,7 @@ class PackedModel:
             packed = [
                 self.forward([Segment(slots[0], tokens[:5], 0)]),
                 # The rest of the first, packed beside a second sequence that copies its beginning.
-                self.forward(
-                    [Segment(slots[0], tokens[5:], 5), Segment(slots[1], tokens[8:], 8, source=slots[0])]
-                ),
+                self.forward([Segment(slots[0], tokens[5:], 5), Segment(slots[1], tokens[8:], 8, source=slots[0])]),
             ]
         with _evaluating(self.model):
             plain = self.model(input_ids=torch.tensor([tokens], device=self.device), use_cache=False).logits[0].float()
@@ -170,9 +172,9 @@ class PackedModel:
         limit = 1e-3 if exact else 0.1
         if not error <= limit:
             raise LLMError(
-                f"the local backend does not compute {type(self.model).__name__} ({self.config.model_type}) correctly: its "
-                f"logits differ by {error:.2g} of their size from the model's own (at most {limit:g} is rounding); serve "
-                "the model (vLLM) and use the `openai` backend"
+                f"the local backend does not compute {type(self.model).__name__} ({self.config.model_type}) correctly: "
+                f"its logits differ by {error:.2g} of their size from the model's own (at most {limit:g} is rounding); "
+                "serve the model (vLLM) and use the `openai` backend"
             )
         self._checked = True
 
@@ -232,7 +234,7 @@ def packed_attention(
         k, v = keys[None, :, :total], values[None, :, :total]
         mask = _mask(pack, n, total, groups, sliding_window or 0, q)
         if softcap is None and s_aux is None:
-            o = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scaling)
+            o = scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scaling)
         else:
             o = _attend(q, k, v, mask, scaling, softcap, s_aux)
         out[0, begin:end] = o.reshape(heads, n, -1).transpose(0, 1)
@@ -264,15 +266,18 @@ def _attend(
     softcap: float | None,
     sinks: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Attention written out, for what the fused kernel lacks: soft-capped scores, and attention sinks (one per head)."""
+    """Attention written out, for what the fused kernel lacks: soft-capped scores, and attention sinks (one per
+    head)."""
     scores = torch.matmul(q, k.transpose(-1, -2)).float() * (q.shape[-1] ** -0.5 if scaling is None else scaling)
     if softcap is not None:
         scores = torch.tanh(scores / softcap) * softcap
     if mask is not None:
         scores = scores + mask.float()
     if sinks is not None:
-        per_query = sinks.float().reshape(1, k.shape[1], -1, 1).repeat_interleave(
-            q.shape[2] // (sinks.numel() // k.shape[1]), dim=2
+        per_query = (
+            sinks.float()
+            .reshape(1, k.shape[1], -1, 1)
+            .repeat_interleave(q.shape[2] // (sinks.numel() // k.shape[1]), dim=2)
         )
         scores = torch.cat([scores, per_query], dim=-1)
     weights = scores.softmax(-1)[..., : k.shape[2]]

@@ -1,9 +1,9 @@
 """One row of the batch per sample: what it still has to read, and what it does with the logits it gets.
 
-A row is a small state machine. ``tokens[computed:]`` has to be read; when that is done the row is given the logits of the
-positions from ``wanted`` on and either appends tokens (to be read in turn) or finishes. Sampling inverts the cumulative
-distribution at a uniform number from the row's own generator, which is seeded by the request and the sample's index: what a
-row samples does not depend on what it is batched with.
+A row is a small state machine. ``tokens[computed:]`` has to be read; when that is done the row is given the logits of
+the positions from ``wanted`` on and either appends tokens (to be read in turn) or finishes. Sampling inverts the
+cumulative distribution at a uniform number from the row's own generator, which is seeded by the request and the
+sample's index: what a row samples does not depend on what it is batched with.
 """
 
 from __future__ import annotations
@@ -100,6 +100,10 @@ class SampleRow(Row):
         super().__init__(job, index)
         self.logprobs: list[float] = []
 
+    def completion(self) -> Completion:
+        """What was written, when the row is done."""
+        raise NotImplementedError
+
     @property
     def written(self) -> list[int]:
         """Tokens of the completion so far."""
@@ -155,9 +159,7 @@ class ChoiceRow(SampleRow):
 class FreeRow(SampleRow):
     """Samples until a stop token, a stop string, or ``max_tokens``."""
 
-    def __init__(
-        self, job: Job, index: int, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]
-    ) -> None:
+    def __init__(self, job: Job, index: int, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]) -> None:
         super().__init__(job, index)
         self._stop_ids = stop_ids
         self._decode = decode

@@ -34,7 +34,8 @@ class ModelNotFoundError(LLMError):
 
 @dataclass(frozen=True)
 class ModelSource:
-    """Files of a model: ``path`` (a folder, or a hub id), the ``name`` it is known by, and a PEFT ``adapter`` folder."""
+    """Files of a model: ``path`` (a folder, or a hub id), the ``name`` it is known by, and a PEFT ``adapter``
+    folder."""
 
     path: str
     name: str
@@ -206,8 +207,8 @@ def _verify(folder: Path) -> None:
     ]
     if problems:
         raise LLMError(
-            f"the bundled model was not converted as expected ({'; '.join(problems)}); this version of transformers may "
-            "read GGUF differently: report it, or give a model folder or hub id instead"
+            f"the bundled model was not converted as expected ({'; '.join(problems)}); this version of transformers "
+            "may read GGUF differently: report it, or give a model folder or hub id instead"
         )
 
 

@@ -1,9 +1,9 @@
 """A model that answers from a script: for tests, demonstrators and replays, without weights and without chance.
 
-The answer depends on the request alone, so any number of episodes may share one :class:`ScriptedLLM` and run in any order.
-It is a full backend: its prompts and answers have token ids (:class:`ByteTokenizer`, reversible), its prompts grow by exact
-extension like those of a real model, and constrained requests record their allowed tokens, so that everything behind it
-(token sequences, masks, cost accounting) runs on the same records as with weights.
+The answer depends on the request alone, so any number of episodes may share one :class:`ScriptedLLM` and run in any
+order. It is a full backend: its prompts and answers have token ids (:class:`ByteTokenizer`, reversible), its prompts
+grow by exact extension like those of a real model, and constrained requests record their allowed tokens, so that
+everything behind it (token sequences, masks, cost accounting) runs on the same records as with weights.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class ScriptedLLM:
     """Answers from ``script``.
 
     Args:
-        script: a function ``(Request) -> text`` (or a list of ``n`` texts), or a list of answers. Call number ``i`` of an
-            episode (``request.id``) gets answer ``i`` of the list, which starts again at its end; an answer may itself be
-            a list of texts, one per sample.
+        script: a function ``(Request) -> text`` (or a list of ``n`` texts), or a list of answers. Call number ``i``
+            of an episode (``request.id``) gets answer ``i`` of the list, which starts again at its end; an answer may
+            itself be a list of texts, one per sample.
         score: ``(messages, continuation) -> log-probability``; by default minus the number of bytes.
         name: model name in the records.
         max_context: context window in byte tokens.

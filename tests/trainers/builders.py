@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from agentspec.trajectory import Trajectory
-from agentspec.types import Action as Act
 from collections.abc import Sequence
 
+from agentspec.trajectory import Trajectory
+from agentspec.types import Action as Act
 from agentspec.types import (
     ActionSchema,
     AgentInput,

@@ -178,9 +178,14 @@ def uneven_episodes() -> list[Trajectory]:
     return episodes
 
 
-def test_uneven_rows_give_the_full_batch_gradient_in_one_step(tmp_path: Any, monkeypatch: Any) -> None:
+@pytest.mark.parametrize(
+    "packing", [{"packing": "tree"}, {"packing": "tree", "tokens_per_forward": 30}, {"packing": "padded"}]
+)
+def test_uneven_rows_give_the_full_batch_gradient_in_one_step(
+    tmp_path: Any, monkeypatch: Any, packing: dict[str, Any]
+) -> None:
     episodes = uneven_episodes()
-    spy = ours(tmp_path, episodes, monkeypatch, loss_type="dapo")
+    spy = ours(tmp_path, episodes, monkeypatch, loss_type="dapo", **packing)
     assert spy.steps == 1
     returns = torch.tensor(RETURNS).view(GROUPS, GENERATIONS)
     # TRL's convention: sample deviation + 1e-4.
@@ -228,8 +233,8 @@ def test_padded_forwards_equal_row_by_row_ones() -> None:
     tokenizer = tiny_tokenizer()
     model = tiny_model(tokenizer)
     rows = [Row(s, 1.0, i) for i, e in enumerate(uneven_episodes()) for s in build_sequences(e)]
-    alone, _ = rows_logprobs(model, rows, rows_per_forward=1)
-    together, _ = rows_logprobs(model, rows, rows_per_forward=5)
+    alone, _ = rows_logprobs(model, rows)
+    together, _ = rows_logprobs(model, rows, tokens_per_forward=60)
     mask = collate(rows, 0)["tool_mask"]
     assert mask.sum() > 0 and torch.allclose(alone, together, atol=1e-5)
     assert (alone * (1 - mask)).abs().max() == 0
@@ -246,7 +251,7 @@ def test_padded_forwards_equal_row_by_row_ones() -> None:
         ({"estimator": "gpro"}, "did you mean grpo"),
         ({"rewards": {"earnings": 1.0}}, "earning_delta"),
         ({"importance_sampling_level": "sequence"}, "speaks of rows"),
-        ({"env": {"map": "x"}}, "expected {name"),
+        ({"environment": {"map": "x"}}, "expected {name"),
     ],
 )
 def test_what_cannot_work_is_refused_at_start(tmp_path: Any, changes: dict[str, Any], message: str) -> None:

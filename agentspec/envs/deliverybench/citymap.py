@@ -34,6 +34,7 @@ ROADS_FILE = "roads.json"
 WORLD_FILE = "progen_world_enriched.json"
 CM_PER_M = 100.0
 MEMORY_LIMIT = 32
+_CELL_CM = 1000.0
 
 _memory: dict[tuple[str, str], City] = {}
 _lock = threading.Lock()
@@ -132,6 +133,28 @@ class City:
         """The nearest place of `kind` if its anchor is within `tolerance_cm` of `p`, else None."""
         found = self.nearest(kind, p)
         return found[0] if found is not None and found[1] <= tolerance_cm else None
+
+    def pois_near(self, p: Point, tolerance_cm: float = 500.0) -> list[Poi]:
+        """All places whose anchor is within `tolerance_cm` of `p`, nearest first (plain buildings included)."""
+        reach = math.ceil(tolerance_cm / _CELL_CM)
+        column, row = math.floor(p[0] / _CELL_CM), math.floor(p[1] / _CELL_CM)
+        found = [
+            (gap, poi)
+            for dx in range(-reach, reach + 1)
+            for dy in range(-reach, reach + 1)
+            for poi in self._anchor_cells.get((column + dx, row + dy), ())
+            if (gap := math.dist(p, poi.anchor)) <= tolerance_cm
+        ]
+        found.sort(key=lambda pair: pair[0])
+        return [poi for _, poi in found]
+
+    @cached_property
+    def _anchor_cells(self) -> dict[tuple[int, int], list[Poi]]:
+        cells: dict[tuple[int, int], list[Poi]] = {}
+        for poi in self.pois:
+            x, y = poi.anchor
+            cells.setdefault((math.floor(x / _CELL_CM), math.floor(y / _CELL_CM)), []).append(poi)
+        return cells
 
     # -- networks ----------------------------------------------------------------------------------------------
 

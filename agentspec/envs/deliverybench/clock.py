@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from agentspec.envs.deliverybench.bus import first_tick
 from agentspec.envs.deliverybench.grammar import Refused
 from agentspec.envs.deliverybench.state import PARKED, Notice
+from agentspec.envs.deliverybench.transport import sent
 
 if TYPE_CHECKING:
     from agentspec.envs.deliverybench.world import World
@@ -22,7 +23,7 @@ _SLACK = 1e-9
 NEVER = 1 << 60
 
 
-class ShiftOver(Exception):
+class ShiftOver(Exception):  # noqa: N818 - it is an event, not an error
     """The shift ended during an action: the action gets no result."""
 
 
@@ -78,7 +79,7 @@ def interruption(world: World) -> int:
 
 
 def stop_charging(world: World, reason: str) -> None:
-    """End the charging session, if there is one, and record it. ``reason`` is finished, interrupted or no_money."""
+    """End and record the charging session, if any. ``reason``: finished, interrupted, no_money or ended."""
     state = world.state
     session = state.charging
     if session is None:
@@ -90,6 +91,7 @@ def stop_charging(world: World, reason: str) -> None:
         "finished": f"charging finished at {last:.0f} %",
         "no_money": f"charging stopped at {last:.0f} %: no money left",
         "interrupted": f"charging interrupted at {last:.0f} %: the scooter was taken away",
+        "ended": f"charging stopped at {last:.0f} %: the shift is over",
     }
     state.notices.append(Notice("charging", texts[reason], {"battery": last, "reason": reason}))
 
@@ -108,9 +110,9 @@ def go_to_hospital(world: World) -> None:
     world.pay("hospital", -fee)
     world.recorder.hospital.append((state.tick, fee))
     world.recorder.interruptions["hospital_rescue"] += 1
-    world.recorder.idle["hospital"] += rules.hospital_seconds
+    world.recorder.be_idle("hospital", rules.hospital_seconds)
     found = world.city.nearest("hospital", state.position)
-    where = state.position if found is None else found[0].anchor
+    where = state.position if found is None else sent(found[0].anchor)
     if rules.hospital_carries_vehicle:
         jump = math.dist(state.position, where)
         if state.mode == "e-scooter" and world.drain_battery(jump / 100.0):
@@ -133,7 +135,11 @@ def _count(world: World, tick: int) -> None:
 
 
 def _finish(world: World) -> None:
-    _count(world, world.last_tick)
+    """The last tick of the shift, in which only the clock moves."""
+    bag, tick = world.state.bag, world.last_tick
+    bag.advance(tick - 1)
+    bag.tick = max(bag.tick, tick)
+    _count(world, tick)
     world.end("calls" if world.last_tick < world.shift_ticks else "shift")
     raise ShiftOver
 
@@ -181,7 +187,7 @@ def _rent_unpaid(world: World) -> int:
 
 
 def _accrue(world: World, tick: int, charging: bool = True) -> None:
-    """Let linear quantities run to ``tick``; ``charging`` False leaves the session's last step to `_end_charge_step`."""
+    """Let linear quantities run to ``tick``; without ``charging`` the session's last step is left out."""
     state = world.state
     ticks = tick - state.tick
     if ticks <= 0:

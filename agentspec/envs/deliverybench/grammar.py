@@ -23,7 +23,7 @@ MAX_INTEGER = 10**12
 _MISSING = object()
 
 
-class Refused(Exception):
+class Refused(Exception):  # noqa: N818 - an outcome, not an error
     """An action that fails: an own ``code``, a ``message`` for the agent; nothing else of the action happens.
 
     ``unread`` marks answers whose arguments make no sense (they count as parse errors, not as attempts), ``silent``

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from agentspec.envs.deliverybench.clock import blocked, go_to_hospital, interruption, pass_time
@@ -55,6 +56,9 @@ def _target(action: Action, bare_cm: bool) -> Point:
 def _travel(world: World, target: Point) -> float:
     """Walk the route to ``target``; returns its length (cm). Raises Refused when the move ends early."""
     state, rules = world.state, world.rules
+    if not rules.ghost_car:
+        # Rent that ran out while standing still interrupts nothing.
+        state.interrupt_at = None
     route = world.route(target)
     body = Follower(state.position, waypoints_of(route), world.step_length(), rules.nearby, rules.stop_radius)
     start = state.tick
@@ -66,8 +70,12 @@ def _travel(world: World, target: Point) -> float:
         arrived = True
     if arrived and not rules.free_last_metres:
         ticks += body.settle(min(limit, empty) - ticks)
-    pass_time(world, start + ticks - 1)
+    mode = state.mode
     exhausted, depleted = _arrive(world, body, emptied=ticks == empty)
+    if depleted:
+        # All but the last tick were spent riding.
+        world.recorder.mode_ticks[mode] += ticks - 1
+        world.recorder.mode_ticks[state.mode] -= ticks - 1
     pass_time(world, start + ticks)
     if exhausted:
         go_to_hospital(world)
@@ -78,7 +86,7 @@ def _travel(world: World, target: Point) -> float:
         raise blocked()
     if rules.free_last_metres:
         _creep(world, body)
-    return sum(math.dist(a, b) for a, b in zip(route, route[1:], strict=False))
+    return sum(math.dist(a, b) for a, b in pairwise(route))
 
 
 def _creep(world: World, body: Follower) -> None:

@@ -103,6 +103,8 @@ class OrderBook:
 
     def _home(self, building: Poi) -> Poi:
         """The plain building nearest to a drawn building: itself, or the neighbour of a shop."""
+        if building.kind == "building":
+            return building
         home = self._home_of.get(building.id)
         if home is None:
             home = min(self._homes, key=lambda poi: math.dist(poi.center, building.center))

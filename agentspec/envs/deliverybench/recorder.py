@@ -29,7 +29,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.mode_ticks: Counter[str] = Counter()
-        self.idle: Counter[str] = Counter()
+        self.idle: dict[str, float] = {}
         self.interruptions: Counter[str] = Counter()
         self.prevention: Counter[str] = Counter()
         self.attempts: Counter[str] = Counter()
@@ -42,6 +42,10 @@ class Recorder:
         self.purchases: list[tuple[int, str, float]] = []
         self.charges: list[tuple[int, int, float, float, float, str]] = []
         self.rentals: list[tuple[int, int]] = []
+
+    def be_idle(self, cause: str, seconds: float) -> None:
+        """Book idle time (s) under a cause."""
+        self.idle[cause] = self.idle.get(cause, 0.0) + seconds
 
     def dump(self) -> list[Any]:
         """The counters as JSON values (see `load`)."""
@@ -62,7 +66,7 @@ class Recorder:
         recorder = cls()
         n = len(cls.FIELDS)
         for name, counts in zip(cls.FIELDS, data[:n], strict=True):
-            setattr(recorder, name, Counter(counts))
+            setattr(recorder, name, dict(counts) if name == "idle" else Counter(counts))
         recorder.energy_used, recorder.battery_used, recorder.parse_failures = data[n : n + 3]
         hospital, purchases, charges, rentals = data[n + 3 :]
         recorder.hospital = [(t, fee) for t, fee in hospital]
@@ -163,6 +167,7 @@ def _orders(state: State) -> dict[str, Any]:
     return {
         "completed": len(done),
         "late": sum(s.late for s in done),
+        "timeouts": sum(s.late for s in done) + overdue,
         "mean_stars": _mean([s.stars for s in done]),
         "mean_food_stars": _mean([s.food_star for s in done]),
         "temp_ok_rate": _share(done, lambda s: s.temp_ok),

@@ -96,7 +96,14 @@ def _step_pairs(outcome: Outcome, step: Mapping[str, Any], world: World) -> Iter
         yield from _settlement_pairs(settlement, record)
 
 
-_UNREAD = ("PARSE_", "PU_NO_ORDERS", "BAG_EMPTY", "DO_NO_METHOD", "DO_BAD_METHOD", "BUY_EMPTY", "BUY_QTY") + (
+_UNREAD = (
+    "PARSE_",
+    "PU_NO_ORDERS",
+    "BAG_EMPTY",
+    "DO_NO_METHOD",
+    "DO_BAD_METHOD",
+    "BUY_EMPTY",
+    "BUY_QTY",
     "BUY_BAD_ITEMS",
     "PK_COMP",
     "SW_EMPTY",
@@ -115,7 +122,7 @@ def _state_pairs(state: State, want: Mapping[str, Any], world: World) -> Iterato
     yield "money", state.balance, want["earnings"], MONEY
     yield "scooter", scooter.state, want["scooter_state"], 0.0
     yield "scooter parked at", _metres(scooter.park), want["scooter_park"], PLACE
-    yield "renting", state.car is not None, want["renting"], 0.0
+    yield "renting", state.car is not None and not state.ended, want["renting"], 0.0
     yield "car", _car(state), want["car"], PLACE
     yield "charging", _charging(state), want["charging"], LEVEL
     yield "in hospital", state.hospital_until is not None, want["in_hospital"], 0.0

@@ -18,7 +18,6 @@ from typing import Any
 MODES = ("walk", "e-scooter", "drag_scooter", "car", "bus")
 
 
-
 SPEED = {"walk": 200.0, "e-scooter": 600.0, "drag_scooter": 150.0, "car": 1200.0, "bus": 1000.0}
 ENERGY_PER_M = {"walk": 0.08, "e-scooter": 0.01, "drag_scooter": 0.1, "car": 0.008, "bus": 0.006}
 PACE = {"accel": 1.25, "normal": 1.0, "decel": 0.75}
@@ -179,7 +178,8 @@ def quirks() -> dict[str, str]:
 
 
 ORIGINAL = Rules()
-FAIR = replace(ORIGINAL, name="fair", max_active_orders=10, **{name: False for name in quirks()})
+_QUIRKS_OFF: dict[str, Any] = dict.fromkeys(quirks(), False)
+FAIR = replace(ORIGINAL, name="fair", max_active_orders=10, **_QUIRKS_OFF)
 RULE_SETS: Mapping[str, Rules] = {"original": ORIGINAL, "fair": FAIR}
 
 

@@ -30,7 +30,7 @@ def wait(world: World, action: Action) -> str:
     seconds = number(value, action, "seconds")
     if seconds <= 0.0:
         return "waited 0s"
-    world.recorder.idle["wait"] += seconds
+    world.recorder.be_idle("wait", seconds)
     start, rate = state.tick, rules.ticks_per_second
     end = first_tick(start / rate + seconds - 1e-6, start + 1, rate)
     pass_time(world, end, charge_ends=rules.charging_ends_waits)

@@ -48,8 +48,8 @@ _PLAIN = (
 _SETTLEMENT = tuple(field.name for field in fields(Settlement))
 
 
-def dump(state: State, recorder: Recorder) -> bytes:
-    """All of a world that is not a function of city, rules and seed."""
+def dump(state: State, recorder: Recorder, identity: list[Any]) -> bytes:
+    """All of a world that is not a function of city, rules and seed; these are named by ``identity``."""
     table: dict[int, int] = {}
     items: list[list[Any]] = []
 
@@ -66,6 +66,7 @@ def dump(state: State, recorder: Recorder) -> bytes:
     scooter, car, session = state.scooter, state.car, state.charging
     data = {
         "version": VERSION,
+        "world": identity,
         "state": [getattr(state, name) for name in _PLAIN],
         "scooter": [scooter.battery, scooter.state, scooter.park],
         "car": None if car is None else [car.since, car.state, car.park],
@@ -83,19 +84,21 @@ def dump(state: State, recorder: Recorder) -> bytes:
     return json.dumps(data, separators=(",", ":")).encode()
 
 
-def load(blob: bytes, rules: Rules, book: OrderBook) -> tuple[State, Recorder]:
+def load(blob: bytes, rules: Rules, book: OrderBook, identity: list[Any]) -> tuple[State, Recorder]:
     """State and recorder of a `dump`.
 
     Raises:
-        ValueError: the bytes are no snapshot of this version.
+        ValueError: the bytes are no snapshot of this version, or of another world.
     """
     try:
         data = json.loads(blob)
         if data["version"] != VERSION:
             raise ValueError(f"version {data['version']!r}, expected {VERSION}")
+        if data["world"] != identity:
+            raise ValueError(f"it is of world {data['world']}, this one is {identity}: restore it where it was taken")
         return _state(data, rules, book), Recorder.load(data["recorder"])
     except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        raise ValueError(f"not a snapshot of a delivery world ({type(error).__name__}: {error})") from error
+        raise ValueError(f"not a snapshot of this delivery world ({type(error).__name__}: {error})") from error
 
 
 def _state(data: dict[str, Any], rules: Rules, book: OrderBook) -> State:
@@ -118,10 +121,9 @@ def _state(data: dict[str, Any], rules: Rules, book: OrderBook) -> State:
         state.orders[number] = OrderState(
             book[number], accepted, score, picked, [items[n] for n in held], [items[n] for n in pending]
         )
-    state.settlements = [
-        Settlement(*(tuple(value) if isinstance(value, list) else value for value in row))
-        for row in data["settlements"]
-    ]
+    for row in data["settlements"]:
+        values: list[Any] = [tuple(value) if isinstance(value, list) else value for value in row]
+        state.settlements.append(Settlement(*values))
     state.notices = [Notice(kind, text, facts) for kind, text, facts in data["notices"]]
     return state
 

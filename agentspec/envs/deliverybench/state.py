@@ -44,7 +44,7 @@ class Car:
 
 @dataclass(slots=True)
 class Charging:
-    """A running charging session: started at tick ``since`` and ``first`` %, goes on to ``target`` %; ``cost`` so far."""
+    """A running session: started at tick ``since`` and ``first`` %, goes on to ``target`` %; ``cost`` so far."""
 
     since: int
     first: float
@@ -82,8 +82,8 @@ class State:
     the accepted, undelivered orders by id; ``settlements`` the delivered ones in order of delivery. ``pool`` lists the
     ids on offer and ``next_order`` the id that will be drawn next. ``recent`` are the last five successful actions,
     oldest first; ``error`` is the last failure until something succeeds; ``notices`` last until the next action that
-    clears them. ``hospital_until`` is the tick of release. ``hands_at`` is the tick up to which food in the hand has cooled. ``interrupt_at`` is the tick at which a pending
-    interruption strikes. ``reason`` is "" until the episode ends.
+    clears them. ``hospital_until`` is the tick of release; ``interrupt_at`` the tick at which a pending interruption
+    strikes; ``hands_at`` the tick up to which food in the hand has cooled. ``reason`` is "" until the episode ends.
     """
 
     position: Point

@@ -43,30 +43,43 @@ class Follower:
 
     def run(self, target: Point, max_ticks: int) -> tuple[int, bool]:
         """Walk until within tolerance of ``target``, at most ``max_ticks`` ticks; returns (ticks, arrived)."""
-        used, last = 0, len(self.waypoints) - 1
+        # The innermost loop of the simulation, hence local variables and no calls of own methods.
+        waypoints, step, reach = self.waypoints, self.step, self.tolerance
+        i, last, used = self._next, len(waypoints) - 1, 0
+        x, y = self.x, self.y
         tx, ty = target
-        tolerance, step = self.tolerance, self.step
-        tolerance_sq = tolerance * tolerance
+        arrived = False
         while used < max_ticks:
-            distance = self._aim()
-            creeping = self._next == last and distance <= tolerance
-            stop = self.stop_radius if creeping else tolerance
-            if distance <= stop:
-                return used, False
-            ticks = min(max(1, math.ceil((distance - stop) / step - _SLACK)), max_ticks - used)
-            # Along this leg: does the body pass within tolerance of the target?
-            wx, wy = tx - self.x, ty - self.y
-            ahead = wx * self.ux + wy * self.uy
-            aside_sq = wx * wx + wy * wy - ahead * ahead
-            if aside_sq <= tolerance_sq:
-                half = math.sqrt(max(0.0, tolerance_sq - aside_sq))
+            dx, dy = waypoints[i][0] - x, waypoints[i][1] - y
+            distance = math.hypot(dx, dy)
+            while distance <= reach and i < last:
+                i += 1
+                dx, dy = waypoints[i][0] - x, waypoints[i][1] - y
+                distance = math.hypot(dx, dy)
+            left = distance - (self.stop_radius if distance <= reach else reach)
+            if left <= 0.0:
+                break
+            ux, uy = dx / distance, dy / distance
+            ticks = math.ceil(left / step - _SLACK) or 1
+            ticks = min(ticks, max_ticks - used)
+            # Does the body pass within reach of the target on this leg?
+            wx, wy = tx - x, ty - y
+            ahead = wx * ux + wy * uy
+            room_sq = reach * reach - (wx * wx + wy * wy - ahead * ahead)
+            if room_sq >= 0.0:
+                half = math.sqrt(room_sq)
                 first = max(1, math.ceil((ahead - half) / step - _SLACK))
                 if first <= ticks and first * step <= ahead + half + _SLACK:
-                    self._walk(first * step)
-                    return used + first, True
-            self._walk(ticks * step)
+                    ticks, arrived = first, True
+            x += ux * ticks * step
+            y += uy * ticks * step
             used += ticks
-        return used, False
+            self.ux, self.uy = ux, uy
+            if arrived:
+                break
+        self.x, self.y, self._next = x, y, i
+        self.travelled += used * step
+        return used, arrived
 
     def settle(self, max_ticks: int) -> int:
         """Creep on to the stop radius of the last waypoint, at most ``max_ticks`` ticks; returns the ticks it takes.
@@ -124,6 +137,11 @@ def ticks_until_empty(level: float, per_tick: float) -> int | None:
     return max(1, math.ceil(level / per_tick - _SLACK))
 
 
+def sent(point: Point) -> Point:
+    """A point as sent to the body: two decimals of a centimetre."""
+    return (round(point[0], 2), round(point[1], 2))
+
+
 def waypoints_of(route: Sequence[Point]) -> list[Point]:
-    """A route as sent to the body: two decimals of a centimetre, without the starting point."""
+    """A route as sent to the body, without the starting point."""
     return [(round(x, 2), round(y, 2)) for x, y in route[1:]] or [route[0]]

@@ -10,6 +10,7 @@ from agentspec.envs.deliverybench.clock import go_to_hospital, pass_time, stop_c
 from agentspec.envs.deliverybench.grammar import Refused, argument, number, short, unread
 from agentspec.envs.deliverybench.moving import charge_way
 from agentspec.envs.deliverybench.state import DEPLETED, PARKED, USABLE, Car, Charging, Notice
+from agentspec.envs.deliverybench.transport import sent
 from agentspec.types import Action
 
 if TYPE_CHECKING:
@@ -54,13 +55,14 @@ def switch(world: World, action: Action) -> str:
 
 def _refusal(world: World, target: str, wish: str) -> Refused | None:
     """Why the switch cannot be made, or None."""
-    state, rules = world.state, world.rules
+    state = world.state
     if not target:
         return Refused("SW_BAD_TARGET", f"cannot switch to {short(wish)}; use walk, e-scooter, car or drag_scooter")
     if target in ("e-scooter", "drag_scooter"):
         held = target == "drag_scooter" and state.mode in ("e-scooter", "drag_scooter")
         if not held and not world.near(state.scooter.park):
-            return Refused("SW_NOT_NEAR_SCOOTER", f"your scooter is not here{_where(state.scooter.park)}: go there first")
+            where = _where(state.scooter.park)
+            return Refused("SW_NOT_NEAR_SCOOTER", f"your scooter is not here{where}: go there first")
     if target == "car":
         if state.car is None:
             return Refused("SW_NO_CAR", "you have no car: rent one at a car rental first")
@@ -104,7 +106,8 @@ def charge(world: World, action: Action) -> str:
     if target > state.scooter.battery:
         state.charging = Charging(state.tick, state.scooter.battery, target)
         world.recorder.prevention["early_charge"] += 1
-        world.recorder.idle["wait"] += (target - state.scooter.battery) / rules.charge_per_min * 60.0
+        seconds = (target - state.scooter.battery) / rules.charge_per_min * 60.0
+        world.recorder.be_idle("wait", seconds)
     return f"charging the scooter to {target:.0f} %"
 
 
@@ -197,7 +200,7 @@ def _ride(world: World, stop: str) -> None:
     phase = world.timetable.phase(state.tick)
     assert phase is not None
     metres = math.dist(state.position, phase.position) / 100.0
-    state.position = (round(phase.position[0], 4), round(phase.position[1], 4))
+    state.position = sent(phase.position)
     if rules.bus_ride_costs_walking:
         world.set_mode(before)
         exhausted, _ = charge_way(world, metres)
@@ -216,7 +219,9 @@ def view_bus_schedule(world: World, action: Action) -> str:
         world.notify("schedule", "this city has no bus")
         return "viewed the bus schedule"
     left = max(0.0, phase.until - state.tick / rules.ticks_per_second)
-    doing = f"stands at {phase.stop} for {left:.0f}s more" if phase.stopped else f"reaches {phase.target} in {left:.0f}s"
+    doing = f"stands at {phase.stop} for {left:.0f}s more"
+    if not phase.stopped:
+        doing = f"reaches {phase.target} in {left:.0f}s"
     line = " - ".join(timetable_line(world))
     text = f"{BusTimetable.bus_id} {doing}. Line: {line}; it waits {rules.bus_dwell:.0f}s at each stop."
     facts = {"stopped": phase.stopped, "stop": phase.stop, "target": phase.target, "seconds": left}

@@ -74,6 +74,7 @@ def pickup(world: World, action: Action) -> str:
     ready = [state.orders[n] for n in known if n in state.orders and _collectable(world, state.orders[n])]
     if not ready:
         raise Refused("PU_NOTHING", "nothing to pick up here: " + "; ".join(_why_not(world, n) for n in known[:5]))
+    world.look()
     for order in ready:
         _take(world, order)
     world.notify("bagging", "put the food into the bag with PLACE_FOOD_IN_BAG")

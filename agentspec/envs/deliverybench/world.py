@@ -19,7 +19,7 @@ from agentspec.envs.deliverybench import moving, services, vehicles, work
 from agentspec.envs.deliverybench.bag import MAX_DAMAGE, Bag
 from agentspec.envs.deliverybench.bus import BusTimetable
 from agentspec.envs.deliverybench.citymap import City
-from agentspec.envs.deliverybench.clock import ShiftOver
+from agentspec.envs.deliverybench.clock import ShiftOver, stop_charging
 from agentspec.envs.deliverybench.food import toward_ambient
 from agentspec.envs.deliverybench.grammar import Refused, schema_for
 from agentspec.envs.deliverybench.orders import OrderBook
@@ -129,6 +129,7 @@ class World:
         self.last_tick = self.shift_ticks
         self.book, self.timetable = _shared(city, self.rules, seed)
         self.recorder = Recorder()
+        self._identity = [city.name, self.rules.name, seed, self.shift_ticks]
         self._inert = self.rules.hand_food_is_inert
         self.state = self._fresh()
 
@@ -240,15 +241,15 @@ class World:
 
     def snapshot(self) -> bytes:
         """The exact state as bytes, for `restore` into a world of the same city, rules and seed."""
-        return dump(self.state, self.recorder)
+        return dump(self.state, self.recorder, self._identity)
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`.
 
         Raises:
-            ValueError: the bytes are no snapshot.
+            ValueError: the bytes are no snapshot of such a world.
         """
-        self.state, self.recorder = load(blob, self.rules, self.book)
+        self.state, self.recorder = load(blob, self.rules, self.book, self._identity)
         self.last_tick = self.shift_ticks
 
     # -- what handlers use -------------------------------------------------------------------------------------
@@ -356,7 +357,7 @@ class World:
         """End the episode: rental and charging are closed."""
         state = self.state
         state.reason = reason
-        self.state.bag.advance(state.tick)
+        stop_charging(self, "ended")
         if state.car is not None:
             self.recorder.rentals.append((state.car.since, state.tick))
 
@@ -392,5 +393,3 @@ def _shared(city: City, rules: Rules, seed: int | None) -> tuple[OrderBook, BusT
         line = city.bus
         timetable = store[bus_key] = BusTimetable(line.stop_names, line.stops, line.points, rules)
     return book, timetable
-
-

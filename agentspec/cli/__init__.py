@@ -1,0 +1,40 @@
+"""The command line: ``agentspec run | eval | export | list | view``.
+
+Thin: every command parses its arguments, calls the library and prints. Input that cannot work is one line on stderr
+that names the remedy, and exit code 2; an episode that failed while running is exit code 1; anything unexpected keeps
+its traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from agentspec.cli.errors import expected_errors, fail
+
+__all__ = ["expected_errors", "fail", "main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments without the program's name; default: those of the process.
+
+    Returns:
+        The exit code. Errors of the input end the process with code 2 instead (``SystemExit``).
+    """
+    from agentspec.cli.parser import build_parser
+
+    arguments = build_parser().parse_args(argv)
+    with expected_errors():
+        try:
+            code: int = arguments.command(arguments)
+            sys.stdout.flush()
+            return code
+        except BrokenPipeError:  # the reader (head, less) has seen enough
+            sys.stdout = None  # type: ignore[assignment]  # nothing is left to flush into
+            return 0
+        except KeyboardInterrupt:
+            sys.stderr.write("agentspec: stopped\n")
+            return 130

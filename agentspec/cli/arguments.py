@@ -1,0 +1,126 @@
+"""What several commands take: an environment with options, specs, seeds, a model."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
+
+if TYPE_CHECKING:
+    from eval.policies import Policy
+
+LABEL_CHARACTERS = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+.() ")
+
+
+def add_environment(parser: argparse.ArgumentParser) -> None:
+    """``--env`` and the options of the environment."""
+    group = parser.add_argument_group("environment")
+    group.add_argument("--env", default="deliverybench", help="registered name or gymnasium id (default: %(default)s)")
+    group.add_argument("--map", metavar="DIR", help="folder of a city map (default: a generated city)")
+    group.add_argument("--shift-hours", type=float, metavar="H", help="length of the shift, in simulated hours")
+    group.add_argument("--observation", choices=("full", "compact"), help="how much the observation says")
+    group.add_argument("--action-mode", choices=("native", "menu"), help="write action calls, or choose from a menu")
+    group.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="any other option of the environment; the value is YAML; may be repeated",
+    )
+    group.add_argument("--max-steps", type=int, metavar="N", help="most steps of an episode")
+    group.add_argument(
+        "--timeout", type=float, default=60.0, metavar="S", help="seconds per environment call (default: %(default)s)"
+    )
+
+
+def environment_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options for ``gymnasium.make``: those that were given, and no others."""
+    named = ("map", "shift_hours", "observation", "action_mode")
+    given = {name: getattr(arguments, name) for name in named if getattr(arguments, name) is not None}
+    return given | key_values(arguments.option, "--option")
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Settings of the backend."""
+    group = parser.add_argument_group("model")
+    group.add_argument(
+        "--llm",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="setting of the model backend, e.g. backend=openai, base_url=..., dtype=bfloat16; may be repeated",
+    )
+    group.add_argument("--prices", metavar="FILE", help="YAML: {model: {input: $/M tokens, output: ..., cached: ...}}")
+
+
+def load_prices(path: str | None) -> Any:
+    """The price table of ``--prices`` (all models free without one)."""
+    from agentspec.llm.pricing import Prices
+
+    return Prices.from_yaml(path) if path else Prices()
+
+
+def key_values(items: Sequence[str], what: str) -> dict[str, Any]:
+    """``["a=1", "b=[x]"]`` as ``{"a": 1, "b": ["x"]}``; values are YAML.
+
+    Raises:
+        SpecError: an item without ``=`` or with a malformed value.
+    """
+    found = {}
+    for item in items:
+        key, equals, text = item.partition("=")
+        if not equals or not key.strip():
+            raise SpecError(f"{what} {item!r}: expected KEY=VALUE")
+        try:
+            found[key.strip().replace("-", "_")] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            problem = getattr(error, "problem", None) or "malformed"
+            raise SpecError(f"{what} {item!r}: the value is not YAML ({problem}); quote it") from error
+    return found
+
+
+def labelled_spec(text: str) -> tuple[str, AgentSpec]:
+    """``FILE``, ``LABEL=FILE``, ``LABEL=YAML`` or inline YAML, as (label, spec).
+
+    Without a label, a file's is its name and inline YAML's is the spec's own (``react+base``).
+    """
+    label, equals, rest = text.partition("=")
+    if Path(text).is_file() or not equals or not set(label) <= LABEL_CHARACTERS:
+        label, rest = "", text
+    spec = AgentSpec.from_yaml(rest)
+    if not label:
+        label = Path(rest).stem if Path(rest).is_file() else spec.label
+    return label, spec
+
+
+def parse_seeds(texts: Sequence[str]) -> list[int]:
+    """``0-3``, ``0,1,2`` or several of these, as a list of seeds without repeats.
+
+    Raises:
+        SpecError: not of that form.
+    """
+    seeds: list[int] = []
+    for part in ",".join(texts).split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise SpecError(f"seeds {part!r}: expected numbers and ranges such as 0-15 or 0,4,8")
+        seeds += range(int(first), int(last or first) + 1)
+    if not seeds:
+        raise SpecError(f"seeds {' '.join(texts)!r} name no seed: a range counts upwards, such as 0-15")
+    return list(dict.fromkeys(seeds))
+
+
+def parse_policy(text: str, arguments: argparse.Namespace) -> Policy:
+    """A policy, with the settings of ``--llm`` if it is a model."""
+    from eval.policies import Policy
+
+    policy = Policy.parse(text)
+    if policy.scripted:
+        return policy
+    return Policy(policy.name, policy.model, policy.adapter, key_values(arguments.llm, "--llm"))

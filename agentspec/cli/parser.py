@@ -1,0 +1,33 @@
+"""Arguments of all commands. Nothing heavy is imported to parse them."""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+from agentspec.cli import evaluate, export, listing, run, view
+from agentspec.cli.errors import PROGRAM, fail
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as every other error of the input."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and where help is, and exit with code 2."""
+        fail(f"{message}; see `{self.prog} --help`")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``agentspec``; each command sets ``command`` to the function that runs it."""
+    parser = Parser(prog=PROGRAM, description="Embodied LLM agents as typed compositions: run, measure, export.")
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for module in (run, evaluate, export, listing, view):
+        module.add_parser(commands)
+    return parser
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    return f"{PROGRAM} {metadata.version(PROGRAM)}"

@@ -1,0 +1,151 @@
+"""``agentspec run``: play episodes and say what came of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from agentspec.cli.arguments import (
+    add_environment,
+    add_model,
+    environment_options,
+    key_values,
+    load_prices,
+    parse_policy,
+)
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
+from agentspec.trajectory import Trajectory, write_trajectories
+from agentspec.types import Task
+
+if TYPE_CHECKING:
+    from eval.policies import Policy
+
+
+def add_parser(commands: Any) -> None:
+    """Arguments of ``agentspec run``."""
+    parser = commands.add_parser("run", help="play episodes", description="Play episodes of one agent.")
+    add_environment(parser)
+    group = parser.add_argument_group("agent")
+    group.add_argument("--spec", metavar="FILE|YAML", help="agent spec: a YAML file, or YAML text")
+    group.add_argument(
+        "--policy",
+        "--model",
+        default="",
+        metavar="NAME",
+        help="rule-based, random, or a model: a folder, bundled name or hub id",
+    )
+    group.add_argument("--adapter", default="", metavar="DIR", help="PEFT adapter on top of the model")
+    group.add_argument(
+        "--sampling", action="append", default=[], metavar="KEY=VALUE", help="sampling, e.g. temperature=0"
+    )
+    add_model(parser)
+    group = parser.add_argument_group("episodes")
+    group.add_argument("--seed", type=int, default=0, help="seed of the first episode's task (default: %(default)s)")
+    group.add_argument("--episodes", type=int, default=1, metavar="N", help="tasks with consecutive seeds")
+    group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group = parser.add_argument_group("output")
+    group.add_argument("--out", metavar="FILE", help="write the trajectories, one JSON line each")
+    group.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
+    group.add_argument("--json", action="store_true", help="print JSON; the last line has the (mean) outcome")
+    parser.set_defaults(command=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Play, print, write; exit code 1 if an episode failed."""
+    from agentspec.cli.frames import Film
+    from agentspec.episode import Job, Runner, make_env
+
+    if arguments.episodes < 1:
+        raise SpecError(f"--episodes is {arguments.episodes}; expected at least 1")
+    policy, spec = agent(arguments)
+    options = environment_options(arguments)
+    tasks = [Task(arguments.env, arguments.seed + i, options, "test") for i in range(arguments.episodes)]
+    # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
+    make_env(tasks[0]).close()
+    film = Film(arguments.gif, tasks[0]) if arguments.gif else None
+    if policy:
+        policy.check()
+    runner = Runner(
+        spec,
+        policy.build() if policy else None,
+        make_env=film.make_env if film else make_env,
+        concurrency=1 if spec.scope == "run" else arguments.concurrency,
+        timeout_s=arguments.timeout,
+        max_steps=arguments.max_steps,
+        prices=load_prices(arguments.prices),
+        policy=policy.name if policy else spec.reasoning.name,
+        on_done=None if arguments.json else _print_outcome,
+    )
+    trajectories = runner.run([Job(task) for task in tasks])
+    if arguments.out:
+        write_trajectories(arguments.out, trajectories)
+    failed = [t for t in trajectories if not t.scorable]
+    if film and not (failed and failed[0] is trajectories[0]):
+        film.save()
+    for trajectory in failed:
+        sys.stderr.write(f"agentspec: episode with seed {trajectory.task.seed} failed: {trajectory.error}\n")
+    if arguments.json:
+        _print_json(trajectories)
+    return 1 if failed else 0
+
+
+def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
+    """The policy (``None`` if the spec needs no model and none was named) and the spec it plays.
+
+    Raises:
+        SpecError: the spec calls a model and none was named.
+    """
+    from eval.policies import needs_model
+
+    spec = AgentSpec.from_yaml(arguments.spec) if arguments.spec else AgentSpec()
+    if arguments.sampling:
+        sampling = {**vars(spec.sampling), **key_values(arguments.sampling, "--sampling")}
+        spec = replace(spec, sampling=AgentSpec.from_data({"sampling": sampling}).sampling)
+    if not arguments.policy:
+        if needs_model(spec):
+            raise SpecError(
+                f"the agent ({spec.label}) calls a model and none was named; give --policy a model (a folder, hub id or "
+                "smollm2-135m), or one that needs none: rule-based, random"
+            )
+        return None, spec
+    policy = parse_policy(arguments.policy, arguments)
+    if arguments.adapter:
+        if policy.scripted:
+            raise SpecError(f"--adapter belongs to a model, and {arguments.policy} is none; leave it out")
+        policy = replace(policy, adapter=arguments.adapter)
+    return policy, policy.apply(spec)
+
+
+def _print_outcome(trajectory: Trajectory) -> None:
+    """One line about a finished episode."""
+    from eval.metrics import BY_NAME, episode_row
+
+    row = episode_row(trajectory)
+    if not trajectory.scorable:
+        return
+    names = ("net_earnings", "hourly_profit", "success", "deliveries", "steps", "invalid_share", "thinking_s_per_step")
+    parts = [f"{BY_NAME[n].heading} {row[n]:.{BY_NAME[n].digits}f}" for n in names if row.get(n) is not None]
+    print(f"seed {trajectory.task.seed}: {', '.join(parts)} (ended by {row['ended']})", flush=True)
+
+
+def _print_json(trajectories: Sequence[Trajectory]) -> None:
+    """With several episodes a line for each; the last line is the outcome, or the mean over episodes that did not fail."""
+    from eval.metrics import outcome
+
+    outcomes = [outcome(t) for t in trajectories]
+    if len(outcomes) == 1:
+        print(json.dumps(outcomes[0]))
+        return
+    for trajectory, result in zip(trajectories, outcomes, strict=True):
+        print(json.dumps({"seed": trajectory.task.seed, "status": trajectory.status, **result}))
+    scored = [o for t, o in zip(trajectories, outcomes, strict=True) if t.scorable]
+    means: dict[str, Any] = {}
+    for name in outcomes[0]:
+        values = [o[name] for o in scored if o[name] is not None]
+        means[name] = sum(values) / len(values) if values else None
+    print(json.dumps({**means, "episodes": len(scored), "failed": len(outcomes) - len(scored)}))

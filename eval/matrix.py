@@ -1,0 +1,298 @@
+"""The matrix: every policy plays every scaffold on the same tasks.
+
+Which scaffold, trained how, for which task? The answer is a table whose cells must be comparable: all policies and
+scaffolds get identical tasks (environment, options and seed) and identical seeds of their own draws. One model is in
+memory at a time and serves all of its scaffolds; each finished episode is a line of ``results.jsonl``, and a stopped
+evaluation goes on from there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from agentspec.actions import suggest
+from agentspec.episode import Job, MakeEnv, Runner, make_env
+from agentspec.llm.base import LLM
+from agentspec.llm.pricing import Prices
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.spec import AgentSpec
+from agentspec.trajectory import Trajectory, jsonable, write_trajectories
+from agentspec.types import Sampling, Task
+from eval.metrics import episode_row
+from eval.policies import Policy
+from eval.results import Results
+
+Tasks = Sequence[Task] | Mapping[str, Sequence[Task]]
+MakeLLM = Callable[[Policy], LLM | None]
+
+GREEDY: Mapping[str, Any] = {"temperature": 0.0}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an evaluation plays.
+
+    Args:
+        rollouts: episodes per task (they differ in the agent's own draws; averaged before intervals are taken).
+        seed: seed of the evaluation; the same for all policies.
+        sampling: fields of :class:`~agentspec.types.Sampling` that replace those of every scaffold; default greedy.
+        concurrency: most episodes at once (``None``: all of a scaffold's).
+        timeout_s: limit of one environment call, in seconds.
+        max_steps: most steps of an episode, on top of the environment's own limit.
+        prices: dollars per token, by model name.
+        trajectories: keep every episode under ``trajectories/``.
+        retry_failed: play cells again whose line says that they failed.
+    """
+
+    rollouts: int = 1
+    seed: int = 0
+    sampling: Mapping[str, Any] = field(default_factory=lambda: GREEDY)
+    concurrency: int | None = None
+    timeout_s: float | None = 60.0
+    max_steps: int | None = None
+    prices: Prices = field(default_factory=Prices)
+    trajectories: bool = False
+    retry_failed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rollouts < 1:
+            raise ValueError(f"rollouts must be at least 1, got {self.rollouts}")
+        names = Sampling.__dataclass_fields__
+        for name in self.sampling:
+            if name not in names:
+                raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
+
+    def apply(self, spec: AgentSpec) -> AgentSpec:
+        """The scaffold with the evaluation's sampling."""
+        return replace(spec, sampling=replace(spec.sampling, **self.sampling))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One row-and-column pair of the matrix with the jobs that are still to play."""
+
+    policy: Policy
+    scaffold: str
+    spec: AgentSpec
+    fingerprint: str
+    jobs: tuple[Job, ...]
+
+
+def evaluate(
+    policies: Sequence[Policy],
+    specs: Mapping[str, AgentSpec],
+    tasks: Tasks,
+    *,
+    out: str | Path,
+    settings: Settings | None = None,
+    make_llm: MakeLLM | None = None,
+    make_env: MakeEnv = make_env,
+    on_row: Callable[[dict[str, Any]], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Play policies x scaffolds x tasks and return one row per episode (see :func:`eval.metrics.episode_row`).
+
+    Args:
+        policies: rows of the matrix; names must differ.
+        specs: scaffold by label: columns of the matrix.
+        tasks: tasks, or several labelled sets of them (one table each); no task may stand in two sets.
+        out: folder of ``results.jsonl``; existing lines are kept and their cells not played again.
+        make_llm: policy -> loaded backend; default: what the policy says. Called once per policy that has to play.
+        make_env: task -> environment.
+        on_row: told of every finished episode.
+
+    Raises:
+        SpecError: names that clash, a scaffold the backend cannot serve, or lines in ``out`` from another
+            configuration under the same names.
+        ModelNotFoundError: a policy's model does not exist. As any error of making an environment (an unknown name, a
+            map that is not there), it is raised before anything is played.
+    """
+    settings = settings or Settings()
+    sets = task_sets(tasks)
+    _check_names(policies, specs)
+    results = Results(out)
+    labels = {task.key: label for label, members in sets.items() for task in members}
+    plan = [
+        [_setting(policy, label, spec, sets, settings, results) for label, spec in specs.items()] for policy in policies
+    ]
+    playing = [[s for s in row if s.jobs] for row in plan]
+    _check_first(playing, sets, make_llm, make_env)
+
+    def finished(setting: Setting, trajectory: Trajectory) -> None:
+        if settings.trajectories:
+            write_trajectories(_trajectory_path(Path(out), setting, trajectory), [trajectory])
+        row = {
+            "policy": setting.policy.name,
+            "scaffold": setting.scaffold,
+            "tasks": labels[trajectory.task.key],
+            "fingerprint": setting.fingerprint,
+            **episode_row(trajectory),
+        }
+        results.append(row)
+        if on_row:
+            on_row(row)
+
+    for row in playing:
+        if row:
+            llm = (make_llm or Policy.build)(row[0].policy)
+            asyncio.run(_play(row, llm, settings, make_env, finished))
+            del llm
+            gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles
+    wanted = [
+        (s.policy.name, s.scaffold, key, rollout)
+        for row in plan
+        for s in row
+        for key in labels
+        for rollout in range(settings.rollouts)
+    ]
+    return [results.by_cell[cell] for cell in wanted]
+
+
+async def _play(
+    row: Sequence[Setting],
+    llm: LLM | None,
+    settings: Settings,
+    make_env: MakeEnv,
+    finished: Callable[[Setting, Trajectory], None],
+) -> None:
+    """All scaffolds of one policy, one after the other, on one loop: the backend may keep what belongs to the loop."""
+    for setting in row:
+        runner = Runner(
+            setting.spec,
+            llm,
+            make_env=make_env,
+            concurrency=settings.concurrency,
+            timeout_s=settings.timeout_s,
+            max_steps=settings.max_steps,
+            prices=settings.prices,
+            policy=setting.policy.name,
+            on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
+        )
+        if setting.spec.scope == "run":
+            await _in_order(runner, setting.jobs)
+        else:
+            await runner.run_async(setting.jobs)
+
+
+async def _in_order(runner: Runner, jobs: Sequence[Job]) -> None:
+    """One episode after the other, each starting from the memory that the last finished one left."""
+    memory: bytes | None = None
+    rollout = 0
+    for job in jobs:
+        if job.rollout != rollout:
+            memory, rollout = None, job.rollout
+        [trajectory] = await runner.run_async([replace(job, memory_state=memory)])
+        if trajectory.scorable:
+            memory = trajectory.memory_state
+
+
+def _setting(
+    policy: Policy,
+    label: str,
+    spec: AgentSpec,
+    sets: Mapping[str, Sequence[Task]],
+    settings: Settings,
+    results: Results,
+) -> Setting:
+    """What is left to play of one pair.
+
+    Raises:
+        SpecError: the file has lines of this pair from another configuration.
+    """
+    spec = settings.apply(policy.apply(spec))
+    content = [spec.to_data(), policy.identity(), settings.seed, settings.max_steps]
+    text = json.dumps(jsonable(content), sort_keys=True)
+    fingerprint = hashlib.sha256(text.encode()).hexdigest()[:12]
+    every = [
+        Job(task, rollout, settings.seed)
+        for rollout in range(settings.rollouts)
+        for members in sets.values()
+        for task in members
+    ]
+    left = []
+    for job in every:
+        row = results.by_cell.get((policy.name, label, job.task.key, job.rollout))
+        if row is not None and row.get("fingerprint") != fingerprint:
+            raise SpecError(
+                f"{results.path} holds results of another configuration under policy {policy.name!r} and scaffold "
+                f"{label!r} (spec, weights, sampling or seed differ); choose another output folder or another label"
+            )
+        if row is None or (settings.retry_failed and row["status"] == "failed"):
+            left.append(job)
+    if left and spec.scope == "run":
+        left = every  # memory that runs on cannot be entered in the middle
+    return Setting(policy, label, spec, fingerprint, tuple(left))
+
+
+def _check_names(policies: Sequence[Policy], specs: Mapping[str, AgentSpec]) -> None:
+    names = [p.name for p in policies]
+    if not names or not specs:
+        raise SpecError(f"nothing to evaluate: got {len(names)} policies and {len(specs)} scaffolds; give at least one")
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise SpecError(f"two policies are called {', '.join(twice)}; give each its own name (NAME=MODEL)")
+
+
+def _check_first(
+    playing: Sequence[Sequence[Setting]],
+    sets: Mapping[str, Sequence[Task]],
+    make_llm: MakeLLM | None,
+    make_env: MakeEnv,
+) -> None:
+    """Find every model and make one environment of each kind: what is missing shows before hours of work, not after."""
+    if not any(playing):
+        return
+    if make_llm is None:
+        for row in playing:
+            if row:
+                row[0].policy.check()
+    for task in {replace(t, seed=0).key: t for members in sets.values() for t in members}.values():
+        make_env(task).close()
+
+
+def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
+    """Labelled sets of tasks; a plain sequence is split by environment and options.
+
+    Raises:
+        SpecError: no task at all, or one task given twice.
+    """
+    if isinstance(tasks, Mapping):
+        sets = {label: list(members) for label, members in tasks.items()}
+    else:
+        groups: dict[str, list[Task]] = {}
+        for task in tasks:
+            groups.setdefault(replace(task, seed=0).key, []).append(task)
+        sets = {}
+        names = [environment_name(members[0].env) for members in groups.values()]
+        for name, members in zip(names, groups.values(), strict=True):
+            options = " ".join(f"{k}={v}" for k, v in members[0].options.items()) if names.count(name) > 1 else ""
+            label = f"{name} {options}".strip()
+            sets[label if label not in sets else f"{label} ({members[0].split})"] = members
+    keys = [task.key for members in sets.values() for task in members]
+    if not keys or len(set(keys)) < len(keys):
+        problem = "no tasks" if not keys else f"{len(keys) - len(set(keys))} of {len(keys)} tasks are given twice"
+        raise SpecError(f"{problem}; give each task (environment, options, seed) exactly once")
+    return sets
+
+
+def environment_name(env: str) -> str:
+    """The registered short name of an environment, or its id."""
+    return next((name for name, entry in REGISTRY.entries.get("env", {}).items() if entry.target == env), env)
+
+
+def _trajectory_path(out: Path, setting: Setting, trajectory: Trajectory) -> Path:
+    folder = out / "trajectories" / _slug(setting.policy.name) / _slug(setting.scaffold)
+    return folder / f"{trajectory.task.key}-{trajectory.rollout}.jsonl"
+
+
+def _slug(name: str) -> str:
+    """A file name that no two labels share."""
+    plain = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "x"
+    return plain if plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"

@@ -1,0 +1,133 @@
+"""Who acts: a model behind a backend, or a scripted courier that needs none.
+
+A policy is applied to a scaffold: a model policy keeps the scaffold as it is; a scripted one takes the place of its
+reasoning, and modules that would call a model are switched off, since there is none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from agentspec.llm.base import LLM
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.spec import MODULE_KINDS, AgentSpec, ModuleSpec
+
+SCRIPTED = ("rule_based", "random")
+"""Reasoning modules that are policies of their own."""
+
+EDGE = 1 << 20
+"""Bytes at either end of a weight file that count for its digest."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy to evaluate.
+
+    Args:
+        name: label in rows and tables; ``rule_based`` and ``random`` (``-`` for ``_`` is fine) are the scripted ones.
+        model: folder, bundled name or hub id; empty: ``name`` is the model.
+        adapter: PEFT folder on top of the model, or empty.
+        backend: further settings of the backend (``backend``, ``base_url``, ``dtype``, ...); default: the local one.
+    """
+
+    name: str
+    model: str = ""
+    adapter: str = ""
+    backend: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str, **settings: Any) -> Policy:
+        """From ``NAME``, ``NAME=MODEL`` or ``NAME=MODEL+ADAPTER`` (a path may stand for the model).
+
+        Raises:
+            SpecError: an empty name or model.
+        """
+        if text.replace("-", "_") in SCRIPTED:
+            return cls(text.replace("-", "_"))
+        name, given, model = text.partition("=")
+        model, _, adapter = (model if given else name).partition("+")
+        if not name or not model:
+            raise SpecError(f"policy {text!r}: expected NAME, NAME=MODEL or NAME=MODEL+ADAPTER")
+        label = name if given else Path(model).name if Path(model).is_dir() else model
+        return cls(label, model, adapter, **settings)
+
+    @property
+    def scripted(self) -> str:
+        """Name of the reasoning module that is this policy, or empty for a model."""
+        name = self.name.replace("-", "_")
+        return name if name in SCRIPTED and not self.model and not self.backend else ""
+
+    def apply(self, spec: AgentSpec) -> AgentSpec:
+        """The scaffold as this policy plays it."""
+        if not self.scripted:
+            return spec
+        quiet = {
+            kind: ModuleSpec("none")
+            for kind in ("memory", "reflection")
+            if calls_model(kind, getattr(spec, kind).name) or REGISTRY.get(kind, getattr(spec, kind).name).needs
+        }
+        return replace(spec, reasoning=ModuleSpec(self.scripted), **quiet)  # type: ignore[arg-type]  # kinds are fields
+
+    def settings(self) -> dict[str, Any]:
+        """What :func:`agentspec.llm.build_llm` builds this policy's backend from."""
+        settings = {"backend": "local", "model": self.model or self.name, **self.backend}
+        return settings | ({"adapter": self.adapter} if self.adapter else {})
+
+    def check(self) -> None:
+        """Find the model's files before anything runs.
+
+        Raises:
+            ModelNotFoundError: no such model or adapter, with the remedy.
+        """
+        settings = self.settings()
+        if not self.scripted and settings["backend"] == "local":
+            from agentspec.llm.models import resolve
+
+            resolve(settings["model"], self.adapter or None)
+
+    def build(self) -> LLM | None:
+        """The backend, loaded; ``None`` for a scripted policy."""
+        if self.scripted:
+            return None
+        from agentspec.llm import build_llm
+
+        llm: LLM = build_llm(self.settings())
+        return llm
+
+    def identity(self) -> dict[str, Any]:
+        """What makes two policies the same: settings, and a digest of weights that lie in a folder."""
+        if self.scripted:
+            return {"scripted": self.scripted}
+        folders = [Path(p) for p in (self.model or self.name, self.adapter) if p]
+        return self.settings() | {"weights": [weights_digest(f) for f in folders if f.is_dir()]}
+
+
+def calls_model(kind: str, name: str) -> bool:
+    """Whether a registered module may call the model, by its declared profile."""
+    calls = REGISTRY.get(kind, name).calls
+    return any(most > 0 for _, most in (calls.retrieve, calls.store, calls.step, calls.episode))
+
+
+def needs_model(spec: AgentSpec) -> bool:
+    """Whether any module of the scaffold may call the model."""
+    return any(calls_model(kind, getattr(spec, kind).name) for kind in MODULE_KINDS)
+
+
+def weights_digest(folder: Path) -> str:
+    """16 hex digits over names, sizes and both ends of a folder's safetensors files.
+
+    Training changes every tensor, so the ends tell retrained weights from old ones without reading gigabytes.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.safetensors")):
+        size = path.stat().st_size
+        digest.update(f"{path.name}:{size}:".encode())
+        with open(path, "rb") as file:
+            digest.update(file.read(EDGE))
+            file.seek(max(0, size - EDGE))
+            digest.update(file.read(EDGE))
+    return digest.hexdigest()[:16]

@@ -1,0 +1,72 @@
+"""The results file: one JSON line per episode, appended as episodes finish.
+
+A run that was stopped goes on where it was: cells whose line is in the file are not played again. The only damage an
+interrupted append can do is a last line without its end; it is cut off when the file is opened.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from agentspec.trajectory import jsonable
+
+Cell = tuple[str, str, str, int]
+"""(policy, scaffold, task key, rollout): what one line is about."""
+
+
+def cell_of(row: Mapping[str, Any]) -> Cell:
+    """The cell of a row."""
+    return row["policy"], row["scaffold"], row["task"], int(row["rollout"])
+
+
+class Results:
+    """Rows in ``folder/results.jsonl`` by cell; a later line about the same cell counts.
+
+    Args:
+        folder: of the evaluation; made when the first row is appended.
+
+    Raises:
+        ValueError: a line that is not a row of results, with its number.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.path = Path(folder) / "results.jsonl"
+        self.by_cell: dict[Cell, dict[str, Any]] = {}
+        if self.path.is_file():
+            self._read()
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """All rows, in the order in which their cells first appeared."""
+        return list(self.by_cell.values())
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Add a row, on disk at once."""
+        data = jsonable(row)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(data, sort_keys=True, ensure_ascii=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self.by_cell[cell_of(data)] = data
+
+    def _read(self) -> None:
+        blob = self.path.read_bytes()
+        whole = blob.rfind(b"\n") + 1
+        if whole < len(blob):
+            os.truncate(self.path, whole)
+        for number, line in enumerate(blob[:whole].decode("utf-8").split("\n"), 1):
+            if not line.strip():
+                continue
+            try:
+                row = json.loads(line)
+                self.by_cell[cell_of(row)] = row
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"{self.path}, line {number} is no row of results ({type(error).__name__}: {error}); "
+                    "repair or remove the line, or choose another folder"
+                ) from error

@@ -1,0 +1,168 @@
+"""Rows of episodes -> cells of the matrix with intervals -> Markdown and JSON.
+
+A table never hides what it leaves out: episodes that failed are counted beside the mean that excludes them, and so are
+episodes that the scaffold's budget or the model's context cut short, which the mean includes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agentspec.state import write_atomic
+from eval.metrics import BY_NAME, CUT_SHORT, METRICS, primary_metric
+from eval.statistics import Estimate, bootstrap, paired_difference
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class CellSummary:
+    """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it."""
+
+    tasks: str
+    policy: str
+    scaffold: str
+    episodes: int
+    failed: int
+    cut_short: int
+    estimates: Mapping[str, Estimate]
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON values."""
+        data = {k: getattr(self, k) for k in ("tasks", "policy", "scaffold", "episodes", "failed", "cut_short")}
+        return data | {"estimates": {name: e.to_data() for name, e in self.estimates.items()}}
+
+
+def values_by_task(rows: Iterable[Row], metric: str) -> dict[str, float]:
+    """Mean over the rollouts of each task; tasks without a number are left out."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row.get("status") == "completed" and row.get(metric) is not None:
+            found.setdefault(row["task"], []).append(float(row[metric]))
+    return {task: math.fsum(values) / len(values) for task, values in found.items()}
+
+
+def summarise(rows: Sequence[Row], *, level: float = 0.95, seed: int = 0) -> list[CellSummary]:
+    """All cells, in the order of their first rows; metrics without any number are left out of ``estimates``."""
+    cells = []
+    for (tasks, policy, scaffold), members in _grouped(rows).items():
+        estimates = {}
+        for metric in METRICS:
+            values = list(values_by_task(members, metric.name).values())
+            if values:
+                estimates[metric.name] = bootstrap(values, level=level, seed=seed)
+        failed = sum(r["status"] != "completed" for r in members)
+        cut = sum(r["status"] == "completed" and r.get("ended") in CUT_SHORT for r in members)
+        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates))
+    return cells
+
+
+def differences(
+    rows: Sequence[Row], metric: str, *, by: str = "policy", level: float = 0.95, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Paired differences to the first policy under the same scaffold (``by="scaffold"``: to the first scaffold).
+
+    Raises:
+        ValueError: ``by`` is neither ``"policy"`` nor ``"scaffold"``.
+    """
+    if by not in ("policy", "scaffold"):
+        raise ValueError(f"by must be 'policy' or 'scaffold', got {by!r}")
+    fixed = "scaffold" if by == "policy" else "policy"
+    found: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
+    for (tasks, policy, scaffold), members in _grouped(rows).items():
+        varied, held = (policy, scaffold) if by == "policy" else (scaffold, policy)
+        found.setdefault((tasks, held), {})[varied] = values_by_task(members, metric)
+    table = []
+    for (tasks, held), values in found.items():
+        baseline = next(iter(values))
+        for name, mine in values.items():
+            if name != baseline:
+                estimate = paired_difference(mine, values[baseline], level=level, seed=seed)
+                table.append({"tasks": tasks, fixed: held, by: name, "baseline": baseline, **estimate.to_data()})
+    return table
+
+
+def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
+    """The report: per set of tasks the matrix of the primary metric, all metrics, and paired differences."""
+    if not rows:
+        return "No episodes.\n"
+    parts = ["# Evaluation", ""]
+    for tasks in dict.fromkeys(row["tasks"] for row in rows):
+        members = [r for r in rows if r["tasks"] == tasks]
+        cells = summarise(members, level=level)
+        primary = primary_metric(list(members))
+        heading, digits = BY_NAME[primary].heading, BY_NAME[primary].digits
+        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} bootstrap interval.", ""]
+        parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
+        for by in ("policy", "scaffold"):
+            compared = differences(members, primary, by=by, level=level)
+            if compared:
+                parts += [f"Paired differences in {heading}, by {by}:", "", *_differences(compared, by, digits), ""]
+    return "\n".join(parts)
+
+
+def write_report(rows: Sequence[Row], folder: str | Path, *, level: float = 0.95) -> None:
+    """Write ``results.md`` and ``summary.json`` beside ``results.jsonl``."""
+    folder = Path(folder)
+    write_atomic(folder / "results.md", markdown(rows, level=level))
+    data = {"level": level, "cells": [c.to_data() for c in summarise(rows, level=level)]}
+    write_atomic(folder / "summary.json", json.dumps(data, indent=2, sort_keys=True) + "\n")
+
+
+def show(estimate: Estimate | None, digits: int) -> str:
+    """``12.3 [10.1, 14.8]``; a dash where there is no number, and no interval for a single task."""
+    if estimate is None or math.isnan(estimate.mean):
+        return "–"
+    mean = f"{estimate.mean:.{digits}f}"
+    if math.isnan(estimate.low):
+        return mean
+    return f"{mean} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
+
+def _grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["tasks"], row["policy"], row["scaffold"]), []).append(row)
+    return groups
+
+
+def _matrix(cells: Sequence[CellSummary], metric: str, digits: int) -> list[str]:
+    scaffolds = list(dict.fromkeys(c.scaffold for c in cells))
+    by = {(c.policy, c.scaffold): c for c in cells}
+    body = [
+        [policy, *(show(by[policy, s].estimates.get(metric), digits) if (policy, s) in by else "–" for s in scaffolds)]
+        for policy in dict.fromkeys(c.policy for c in cells)
+    ]
+    return table(["policy", *scaffolds], body)
+
+
+def _details(cells: Sequence[CellSummary]) -> list[str]:
+    metrics = [m for m in METRICS if any(m.name in c.estimates for c in cells)]
+    header = ["policy", "scaffold", "episodes", "failed", "cut short", *(m.heading for m in metrics)]
+    body = []
+    for c in cells:
+        means = [c.estimates.get(m.name) for m in metrics]
+        shown = ["–" if e is None else f"{e.mean:.{m.digits}f}" for m, e in zip(metrics, means, strict=True)]
+        body.append([c.policy, c.scaffold, str(c.episodes), str(c.failed), str(c.cut_short), *shown])
+    return table(header, body)
+
+
+def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
+    fixed = "scaffold" if by == "policy" else "policy"
+    body = []
+    for row in rows:
+        numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
+        estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
+        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), str(row["n"])])
+    return table([fixed, "difference", "mean", "tasks"], body)
+
+
+def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table; ``|`` in a cell is escaped."""
+    lines = [list(header), ["---"] * len(header), *(list(row) for row in body)]
+    return ["| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines]

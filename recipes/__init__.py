@@ -1,0 +1,1 @@
+"""Recipes: one readable script per experiment. They see everything; nothing imports them."""

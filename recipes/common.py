@@ -1,0 +1,100 @@
+"""What the recipes share: reading a config, training, resuming."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+os.environ.setdefault("WANDB_MODE", "offline")
+
+CONFIGS = Path(__file__).parent / "configs"
+
+
+def parse_config(argv: Sequence[str] | None = None, default: str = "quickstart_cpu.yaml") -> Any:
+    """The run's configuration from ``--config FILE`` and command-line overrides; without ``--config`` the default.
+
+    Raises:
+        SpecError: malformed YAML, an unknown key, or a value of the wrong kind.
+    """
+    from trl import TrlParser
+
+    from agentspec.actions import suggest
+    from agentspec.registry import SpecError
+    from agentspec.spec import load_yaml
+    from trainers.config import ScaffoldConfig
+
+    args = list(sys.argv[1:] if argv is None else argv)
+    if "--config" not in args and not any(a.startswith("--config=") for a in args):
+        args = ["--config", str(CONFIGS / default), *args]
+    path = next((a.partition("=")[2] for a in args if a.startswith("--config=")), None)
+    path = path or args[args.index("--config") + 1]
+    data = load_yaml(Path(path))
+    known = ScaffoldConfig.__dataclass_fields__
+    for key in data:
+        if key not in known:
+            raise SpecError(f"{path}: unknown key {key!r}{suggest(str(key), known)}")
+    try:
+        (config,) = TrlParser((ScaffoldConfig,)).parse_args_and_config(args=args)
+    except ValueError as error:
+        raise SpecError(f"{path}: {error}") from error
+    return config
+
+
+def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
+    """Train as ``config`` says; returns the trainer. The final model lies in ``config.output_dir``.
+
+    With ``config.resume`` the run continues from its last checkpoint.
+    """
+    from datasets import Dataset
+    from transformers.trainer_utils import get_last_checkpoint
+
+    from trainers.grpo import ScaffoldGRPOTrainer
+    from trainers.policy import load_policy
+    from trainers.report import TerminalReport
+    from trainers.rollouts import make_tasks, task_rows
+
+    config.check()
+    folder = Path(config.output_dir)
+    last = get_last_checkpoint(str(folder)) if config.resume and folder.is_dir() else None
+    model, tokenizer = load_policy(config)
+    name, options = config.world
+    tasks = make_tasks(name, options, config.train_tasks)
+    trainer = ScaffoldGRPOTrainer(
+        model,
+        config,
+        train_dataset=Dataset.from_list(task_rows(tasks)),
+        processing_class=tokenizer,
+        callbacks=list(callbacks),
+    )
+    trainer.add_callback(TerminalReport(lambda: trainer.last_episodes))
+    if trainer.accelerator.is_main_process:
+        for note in config.warnings():
+            print(f"note: {note}", file=sys.stderr)
+        trainer.run_log.manifest(config=run_config(config), spec=config.spec.to_data(), resumed_from=last or "")
+    if last:
+        print(f"resuming from {last}", file=sys.stderr)
+    trainer.train(resume_from_checkpoint=last)
+    trainer.save_model(str(folder))
+    return trainer
+
+
+def run_config(config: Any) -> dict[str, Any]:
+    """The configuration as plain data, secrets left out (TRL's own ``to_dict`` masks tokens)."""
+    data: dict[str, Any] = config.to_dict()
+    return data
+
+
+def run_recipe(main: Callable[[], None]) -> None:
+    """Run a recipe; an expected error is one line and exit code 2."""
+    from agentspec.cli import fail
+    from agentspec.llm.base import LLMError
+    from agentspec.registry import SpecError
+
+    try:
+        main()
+    except (SpecError, LLMError, FileNotFoundError) as error:
+        fail(error)

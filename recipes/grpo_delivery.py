@@ -1,0 +1,25 @@
+"""GRPO on DeliveryBench, inside the scaffold.
+
+    accelerate launch recipes/grpo_delivery.py --config recipes/configs/quickstart_cpu.yaml
+
+Without arguments the CPU quick-start runs. Every field of the config can be given on the command line; ``--resume``
+continues from the last checkpoint. On a GPU machine only the config changes (``qwen3_4b_paper.yaml``).
+"""
+
+from __future__ import annotations
+
+from recipes.common import parse_config, run_recipe, train
+
+
+def main() -> None:
+    """Train, save the adapter, draw the reward curve."""
+    config = parse_config()
+    trainer = train(config)
+    if config.plots and trainer.accelerator.is_main_process:
+        from eval.plots import reward_curve
+
+        reward_curve(trainer.run_log.read("metrics.jsonl"), trainer.run_log.folder / "reward_curve.png")
+
+
+if __name__ == "__main__":
+    run_recipe(main)

@@ -1,0 +1,60 @@
+"""The policy to train: a base model from the resolver, with a LoRA adapter, new or warm-started."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from agentspec.llm.base import LLMError
+from agentspec.registry import SpecError
+from trainers.config import ScaffoldConfig
+
+
+def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
+    """Model and tokenizer of ``config``.
+
+    float32 on a CPU (bfloat16 is slower there), bfloat16 where the config says ``bf16``. With ``lora_r: 0`` all
+    weights are trained.
+
+    Raises:
+        LLMError: the model or adapter cannot be found.
+        SpecError: an adapter together with ``lora_r: 0``.
+    """
+    from peft import LoraConfig, PeftModel, get_peft_model
+    from transformers import AutoModelForCausalLM, AutoTokenizer
+
+    from agentspec.llm.models import resolve
+
+    source = resolve(config.model)
+    dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
+    tokenizer = AutoTokenizer.from_pretrained(source.path)
+    model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
+    if config.adapter:
+        if config.lora_r == 0:
+            raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
+        try:
+            return PeftModel.from_pretrained(model, resolve_adapter(config.adapter), is_trainable=True), tokenizer
+        except (OSError, ValueError) as error:
+            raise LLMError(f"adapter {config.adapter!r} cannot be loaded: {error}") from error
+    if config.lora_r == 0:
+        return model, tokenizer
+    targets: Any = config.lora_targets[0] if config.lora_targets == ["all-linear"] else config.lora_targets
+    lora = LoraConfig(
+        r=config.lora_r,
+        lora_alpha=config.lora_alpha or 2 * config.lora_r,
+        target_modules=targets,
+        lora_dropout=0.0,  # dropout would make the update's log-probabilities differ from the sampled ones
+        task_type="CAUSAL_LM",
+    )
+    torch.manual_seed(config.seed)
+    return get_peft_model(model, lora), tokenizer
+
+
+def resolve_adapter(name: str) -> str:
+    """A PEFT folder, by path or by the name of an adapter that ships with ``trainers``."""
+    from pathlib import Path
+
+    bundled = Path(__file__).parent / "adapters" / name
+    return str(bundled) if (bundled / "adapter_config.json").is_file() else name
