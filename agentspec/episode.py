@@ -163,7 +163,7 @@ class Runner:
 
     async def run_async(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """As :meth:`run`, inside a running loop."""
-        llm = self.llm or NoLLM()
+        llm: LLM = self.llm or NoLLM()
         self.spec.check(frozenset(llm.capabilities) | {"snapshots"}, f"backend {llm.name!r}")
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 

@@ -117,6 +117,14 @@ register(
 
 register("memory", "none", "agentspec.memory.none:NoMemory", "remembers nothing")
 register("memory", "base", "agentspec.memory.base:BaseMemory", "rolling buffer of the most recent steps")
+register(
+    "memory",
+    "summary",
+    "agentspec.memory.summary:SummaryMemory",
+    "SUPO: the policy's own summary replaces the conversation every 8 actions",
+    calls=CallProfile(store=(0, 1)),
+    purposes=("summary",),
+)
 
 register(
     "reasoning",

@@ -75,6 +75,8 @@ class Policy:
     def settings(self) -> dict[str, Any]:
         """What :func:`agentspec.llm.build_llm` builds this policy's backend from."""
         settings = {"backend": "local", "model": self.model or self.name, **self.backend}
+        if "script" in settings:
+            del settings["model"]  # a scripted backend has a script in the model's place
         return settings | ({"adapter": self.adapter} if self.adapter else {})
 
     def check(self) -> None:

@@ -30,6 +30,9 @@ ROW_LOSSES = {
 }
 """Loss types that depend on how episodes split into rows, and how."""
 
+STEP_ESTIMATORS = ("reward_to_go", "gigpo")
+ENDS = ("context", "budget", "max_steps", "truncated")
+
 REFUSED_LOSSES = {
     "luspo": "it sums per row, so an episode counts once per row",
     "sapo": "it averages per row and has no test against stock TRL here",
@@ -51,7 +54,16 @@ class ScaffoldConfig(GRPOConfig):
         train_calls: patterns over ``module/purpose`` of the calls that are trained.
         train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
         rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
-        estimator: how returns become advantages (``grpo``, ``centred``, ``rloo``).
+        estimator: how returns become advantages: per episode ``grpo``, ``centred``, ``rloo``; per step
+            ``reward_to_go``, ``gigpo``.
+        gamma: discount per step of the step-level estimators.
+        gigpo_weight: weight of the step advantage in ``gigpo``.
+        skip_zero_variance: leave groups whose returns are all equal out of the loss denominator too.
+        overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
+            the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
+        overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
+        mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
+        retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
         packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
@@ -75,7 +87,14 @@ class ScaffoldConfig(GRPOConfig):
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
     rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
-    estimator: str = field(default="grpo", metadata={"help": "grpo, centred or rloo"})
+    estimator: str = field(default="grpo", metadata={"help": "grpo, centred, rloo, reward_to_go or gigpo"})
+    gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
+    gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
+    skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
+    overlong: str = field(default="mask", metadata={"help": "mask, keep or drop"})
+    overlong_ends: list[str] = field(default_factory=lambda: ["context"])
+    mask_truncated: list[str] = field(default_factory=list)
+    retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
     packing: str = field(default="tree", metadata={"help": "tree or padded"})
@@ -103,7 +122,8 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def train_filter(self) -> TrainFilter:
         """Which completions are trained."""
-        return TrainFilter(tuple(self.train_calls), tuple(self.train_credits))  # type: ignore[arg-type]  # checked
+        credits: Any = tuple(self.train_credits)
+        return TrainFilter(tuple(self.train_calls), credits, tuple(self.mask_truncated))
 
     @property
     def world(self) -> tuple[str, dict[str, Any]]:
@@ -112,9 +132,8 @@ class ScaffoldConfig(GRPOConfig):
         Raises:
             SpecError: not of the form ``{name: ..., options: {...}}``.
         """
-        given = self.environment if self.environment is not None else {"name": "deliverybench"}
-        if isinstance(given, str):
-            given = {"name": given}
+        value = self.environment or "deliverybench"
+        given: dict[str, Any] = {"name": value} if isinstance(value, str) else value
         if not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
             raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")
         return given["name"], dict(given.get("options") or {})
@@ -147,8 +166,14 @@ class ScaffoldConfig(GRPOConfig):
         """
         spec = self.spec
         _ = self.reward_set, self.world
-        if self.estimator not in ESTIMATORS:
-            raise SpecError(f"unknown estimator {self.estimator!r}{suggest(self.estimator, ESTIMATORS)}")
+        known = (*ESTIMATORS, *STEP_ESTIMATORS)
+        if self.estimator not in known:
+            raise SpecError(f"unknown estimator {self.estimator!r}{suggest(self.estimator, known)}")
+        if self.overlong not in ("mask", "keep", "drop"):
+            raise SpecError(f"overlong must be 'mask', 'keep' or 'drop', got {self.overlong!r}")
+        for end in self.overlong_ends:
+            if end not in ENDS:
+                raise SpecError(f"unknown end {end!r} in overlong_ends{suggest(end, ENDS)}")
         if self.packing not in ("tree", "padded"):
             raise SpecError(f"packing must be 'tree' or 'padded', got {self.packing!r}")
         for credit in self.train_credits:

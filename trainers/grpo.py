@@ -8,12 +8,12 @@ in their place: advantages per episode, a fixed number of micro-batches, the den
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
 
@@ -21,13 +21,13 @@ from agentspec.episode import MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers.advantages import ESTIMATORS, zero_variance
 from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.rollouts import collect, rollout_jobs
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
 from trainers.tree import enable_tree
+from trainers.weighing import weigh
 
 ROWS = "rows"
 """Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
@@ -57,6 +57,8 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         args.check()
         self.rewards_used = args.reward_set
         self._episodes: list[Trajectory] = []
+        self._current: dict[str, Any] | None = None
+        self._buffered_inputs: Any = None
         super().__init__(
             model=model,
             args=args,
@@ -140,30 +142,23 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
 
     def _rows(self, mode: str) -> list[Row]:
         """All sequences of this rank's episodes with the advantages of the whole group."""
-        group = self.num_generations if mode == "train" else self.num_generations_eval
-        totals = [self.rewards_used.total(t) for t in self._episodes]
-        local = torch.tensor([math.nan if r is None else r for r in totals], device=self.accelerator.device)
-        returns = self.accelerator.gather(local).view(-1, group)
-        advantages = ESTIMATORS[self.args.estimator](returns).flatten()
-        first = self.accelerator.process_index * len(self._episodes)
-        rows: list[Row] = []
-        silent_episodes = 0
-        for i, trajectory in enumerate(self._episodes):
-            if not trajectory.scorable:
-                continue  # counts in no baseline (NaN above) and in no denominator (no rows)
-            sequences = build_sequences(trajectory, self.args.train_filter)
-            silent_episodes += not sequences
-            rows += [Row(s, advantages[first + i].item(), i) for s in sequences]
-        self._metrics[mode]["groups/zero_variance"].append(zero_variance(returns).float().mean().item())
-        self._metrics[mode]["rollouts/unscorable"].append(returns.isnan().float().mean().item())
-        self._metrics[mode]["rollouts/rows_per_episode"].append(len(rows) / max(1, len(self._episodes)))
-        self._metrics[mode]["rollouts/trained_tokens"].append(float(sum(r.sequence.trained for r in rows)))
-        if mode == "train" and silent_episodes == len(self._episodes):
+        weighed = weigh(
+            self._episodes,
+            self.args,
+            self.rewards_used,
+            group=self.num_generations if mode == "train" else self.num_generations_eval,
+            rank=self.accelerator.process_index,
+            gather=gather_object,
+        )
+        for name, value in weighed.metrics.items():
+            self._metrics[mode][name].append(value)
+        scored = [t for t in self._episodes if t.scorable]
+        if mode == "train" and scored and not any(build_sequences(t, self.args.train_filter) for t in scored):
             raise SpecError(
                 f"no call of this generation batch matched train_calls {self.args.train_calls} with credits "
                 f"{self.args.train_credits}; the scaffold called {sorted(_paths(self._episodes))}"
             )
-        return rows
+        return weighed.rows
 
     # --- updates -----------------------------------------------------------------------------------------------------
 

@@ -26,20 +26,32 @@ class TrainFilter:
     Args:
         patterns: shell patterns over ``module/purpose`` paths; a pattern without ``/`` matches any purpose.
         credits: credits that are trained.
+        mask_truncated: patterns of calls whose completions are context only when they hit their length limit (a
+            summary cut off in the middle, say).
     """
 
     patterns: tuple[str, ...] = ("reasoning.*",)
     credits: tuple[Credit, ...] = ("executed",)
+    mask_truncated: tuple[str, ...] = ()
 
     def matches(self, path: str) -> bool:
         """Whether calls of ``path`` may be trained."""
-        return any(fnmatchcase(path, p if "/" in p else f"{p}/*") for p in self.patterns)
+        return _matches(path, self.patterns)
 
     def completions(self, call: LLMCall) -> list[int]:
         """Indices of the trained completions of ``call``."""
         if not self.matches(call.tag.path):
             return []
-        return [i for i, c in enumerate(call.completions) if c.credit in self.credits and c.token_ids]
+        cut = _matches(call.tag.path, self.mask_truncated)
+        return [
+            i
+            for i, c in enumerate(call.completions)
+            if c.credit in self.credits and c.token_ids and not (cut and c.finish_reason == "length")
+        ]
+
+
+def _matches(path: str, patterns: SequenceOf[str]) -> bool:
+    return any(fnmatchcase(path, p if "/" in p else f"{p}/*") for p in patterns)
 
 
 @dataclass

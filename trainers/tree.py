@@ -30,7 +30,7 @@ from trainers.logprobs import sampled_logprobs
 
 ATTENTION = "agentspec_tree"
 NODE_TOKENS = 512
-"""Longest node: a longer run of tokens becomes a chain of nodes, so that no query block sees far beyond its causal past."""
+"""Longest node: a longer run of tokens becomes a chain of nodes, so that few queries see keys of their future."""
 
 HEAD_CHUNK = 1024
 """Trained tokens projected on the vocabulary at once."""
@@ -49,7 +49,7 @@ class Node:
 class Tree:
     """Sequences packed into a trie.
 
-    ``tokens`` and ``positions`` have one entry per unique token; ``places[r][p]`` is where token p of sequence r stands.
+    ``tokens`` and ``positions`` have one entry per unique token; ``places[r][p]`` is where token p of sequence r is.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -89,7 +89,7 @@ def build_tree(sequences: Sequence[Sequence[int]], node_tokens: int = NODE_TOKEN
             continue
         first, last = sequences[group[0]], sequences[group[-1]]
         # The group is sorted: what its first and last have in common, all have. One may end before the others.
-        end = _common(first, last, depth, min(min(len(sequences[i]) for i in group), depth + node_tokens))
+        end = _common(first, last, depth, min(depth + node_tokens, *(len(sequences[i]) for i in group)))
         start = len(tree.tokens)
         tree.tokens += first[depth:end]
         tree.positions += range(depth, end)
@@ -145,7 +145,8 @@ def enable_tree(model: nn.Module) -> None:
     Raises:
         SpecError: an architecture the packed forward does not compute exactly (checked on a few tokens).
     """
-    base: Any = model.get_base_model() if hasattr(model, "get_base_model") else model
+    wrapper: Any = model
+    base: Any = wrapper.get_base_model() if hasattr(model, "get_base_model") else model
     if getattr(base, "_agentspec_tree", False):
         return
     _register(base)
@@ -199,7 +200,7 @@ def _register(base: Any) -> None:
         ALL_ATTENTION_FUNCTIONS.register(ATTENTION, tree_attention)
         ALL_MASK_ATTENTION_FUNCTIONS.register(ATTENTION, sdpa_mask)
     for module in base.modules():
-        config = getattr(module, "config", None)
+        config: Any = getattr(module, "config", None)
         if hasattr(config, "_attn_implementation_internal"):
             config._attn_implementation_internal = ATTENTION
 

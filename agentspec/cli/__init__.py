@@ -7,6 +7,7 @@ its traceback.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -33,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return code
         except BrokenPipeError:  # the reader (head, less) has seen enough
-            sys.stdout = None  # type: ignore[assignment]  # nothing is left to flush into
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
             return 0
         except KeyboardInterrupt:
             sys.stderr.write("agentspec: stopped\n")

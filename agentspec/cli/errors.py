@@ -19,7 +19,7 @@ from agentspec.registry import SpecError
 PROGRAM = "agentspec"
 
 OURS = ("agentspec", "trainers", "rewards", "eval", "recipes")
-"""Packages whose ``ValueError`` is a check of the input. One that numpy or torch raises is a bug and keeps its trace."""
+"""Packages whose ``ValueError`` is a check of the input; one that numpy or torch raises keeps its traceback."""
 
 EXPECTED = (SpecError, LLMError, yaml.YAMLError, FileNotFoundError, FileExistsError, NotADirectoryError)
 EXPECTED_OS = (IsADirectoryError, PermissionError)

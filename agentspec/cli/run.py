@@ -109,8 +109,8 @@ def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
     if not arguments.policy:
         if needs_model(spec):
             raise SpecError(
-                f"the agent ({spec.label}) calls a model and none was named; give --policy a model (a folder, hub id or "
-                "smollm2-135m), or one that needs none: rule-based, random"
+                f"the agent ({spec.label}) calls a model and none was named; give --policy a model (a folder, hub id "
+                "or smollm2-135m), or one that needs none: rule-based, random"
             )
         return None, spec
     policy = parse_policy(arguments.policy, arguments)
@@ -134,7 +134,7 @@ def _print_outcome(trajectory: Trajectory) -> None:
 
 
 def _print_json(trajectories: Sequence[Trajectory]) -> None:
-    """With several episodes a line for each; the last line is the outcome, or the mean over episodes that did not fail."""
+    """With several episodes a line for each; the last line is the outcome, or the mean over unfailed episodes."""
     from eval.metrics import outcome
 
     outcomes = [outcome(t) for t in trajectories]

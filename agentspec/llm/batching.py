@@ -126,32 +126,47 @@ class Batcher(Generic[T]):
     async def _flush(self, impatient: bool) -> None:
         for _ in range(_TURNS):
             await asyncio.sleep(0)
-        if self._running:
+        batch = self._take(impatient)
+        if not batch:
             return
+        self._running = True
+        error: BaseException | None = None
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._thread, self._run, [p.job for p in batch])
+        except asyncio.CancelledError:
+            error = asyncio.CancelledError()
+            raise
+        except BaseException as raised:  # nobody may be left waiting, whatever it is
+            error = raised
+        finally:
+            self._running = False
+            for p in batch:
+                _settle(p.done, error)
+            # Next: what asked meanwhile.
+            asyncio.get_running_loop().call_soon(self._again)
+
+    def _take(self, impatient: bool) -> list[_Pending[T]]:
+        """The requests to run now, in order: all of them, or those that wait for nobody."""
+        if self._running:
+            return []
         if impatient or self._ready():
             batch, self._pending = self._pending, []
         else:
             batch = [p for p in self._pending if p.episode not in self._live]
             self._pending = [p for p in self._pending if p.episode in self._live]
-        batch.sort(key=lambda p: (p.episode, p.number))
-        if not batch:
-            return
-        self._running = True
-        try:
-            await asyncio.get_running_loop().run_in_executor(self._thread, self._run, [p.job for p in batch])
-        except Exception as error:
-            for p in batch:
-                if not p.done.done():
-                    p.done.set_exception(error)
-        else:
-            for p in batch:
-                if not p.done.done():
-                    p.done.set_result(None)
-        finally:
-            self._running = False
-            # What asked meanwhile, and those that were waiting for nobody else.
-            asyncio.get_running_loop().call_soon(self._again)
+        return sorted(batch, key=lambda p: (p.episode, p.number))
 
     def _again(self) -> None:
         self._flusher = None
         self._wake()
+
+
+def _settle(done: asyncio.Future[None], error: BaseException | None) -> None:
+    if done.done():
+        return
+    if error is None:
+        done.set_result(None)
+    elif isinstance(error, asyncio.CancelledError):
+        done.cancel()
+    else:
+        done.set_exception(error)

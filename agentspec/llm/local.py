@@ -22,7 +22,7 @@ from agentspec.llm.constrain import ChoiceTrie
 from agentspec.llm.local_engine import Engine
 from agentspec.llm.local_forward import PackedModel
 from agentspec.llm.local_rows import Job
-from agentspec.llm.models import resolve
+from agentspec.llm.models import quiet, resolve
 from agentspec.types import LLMCall, Sampling, Usage
 
 
@@ -107,8 +107,9 @@ class LocalLLM:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            tokenizer = AutoTokenizer.from_pretrained(source.path)
-            model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
+            with quiet():
+                tokenizer = AutoTokenizer.from_pretrained(source.path)
+                model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
             if source.adapter:
                 from peft import PeftModel
 
@@ -129,7 +130,7 @@ class LocalLLM:
         trie = self._trie(sampling.choices) if sampling.choices else None
         require_context(len(prompt), trie.longest if trie else sampling.max_tokens, self.max_context)
         job = Job(request.tag.episode, prompt, sampling, request.seed, trie)
-        await self._batcher.submit(request.tag.episode, request.id, job)
+        await self._submit(request.id, job)
         usage = Usage(len(prompt), sum(len(c.token_ids) for c in job.completions), job.cached)
         latency = time.perf_counter() - began
         return LLMCall(request.id, request.tag, tuple(prompt), job.completions, sampling, usage, latency, self.name)
@@ -144,7 +145,7 @@ class LocalLLM:
         encoded = tuple(self.chat.encode(c) for c in continuations)
         require_context(len(prompt), max(map(len, encoded)), self.max_context)
         job = Job(episode, prompt, Sampling(), continuations=encoded)
-        await self._batcher.submit(episode, -1, job)
+        await self._submit(-1, job)
         return job.scores
 
     def count_tokens(self, text: str) -> int:
@@ -164,16 +165,28 @@ class LocalLLM:
         """Drop all cached keys and values: the weights, or the adapter in use, changed."""
         self._engine.cache.clear()
 
+    async def _submit(self, number: int, job: Job) -> None:
+        await self._batcher.submit(job.episode, number, job)
+        if job.error is not None:
+            raise job.error
+
     def _run(self, jobs: Sequence[Job]) -> None:
+        """Run a batch in the worker thread. If it fails, each job runs alone, so that only the one at fault fails."""
         try:
             self._engine.run(jobs)
         except LLMError:
             raise
-        except (RuntimeError, ValueError, TypeError, IndexError) as error:
-            raise LLMError(
-                f"the model {self.name} failed on a batch of {len(jobs)} requests: {type(error).__name__}: {error}; if "
-                "it ran out of memory, lower `max_batch` or `max_cache_tokens`"
-            ) from error
+        except Exception as error:  # whatever a model raises
+            self._engine.cache.clear()
+            if len(jobs) > 1:
+                for job in jobs:
+                    job.completions, job.scores = (), ()
+                    self._run([job])
+                return
+            jobs[0].error = LLMError(
+                f"the model {self.name} failed on a prompt of {len(jobs[0].prompt)} tokens: {type(error).__name__}: "
+                f"{error}; if it ran out of memory, lower `max_batch`, `max_cache_tokens` or the length of prompts"
+            )
 
     def _decode(self, ids: Sequence[int]) -> str:
         return str(self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False))

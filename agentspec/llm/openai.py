@@ -128,8 +128,8 @@ class OpenAILLM:
             LLMError: always.
         """
         raise LLMError(
-            f"{self.name} at {self.base_url} cannot score given continuations (the chat protocol has no such call); use "
-            "the `local` backend, or a method that needs no `score`"
+            f"{self.name} at {self.base_url} cannot score given continuations (the chat protocol has no such call); "
+            "use the `local` backend, or a method that needs no `score`"
         )
 
     def count_tokens(self, text: str) -> int:
@@ -227,8 +227,8 @@ class OpenAILLM:
             answer = None
         if not isinstance(answer, dict) or not isinstance(answer.get("choices"), list) or not answer["choices"]:
             raise LLMError(
-                f"{self.base_url} answered without `choices`: {self._redact(response.text[:200])!r}; is this the address "
-                "of an OpenAI-compatible API (it usually ends in /v1)?"
+                f"{self.base_url} answered without `choices`: {self._redact(response.text[:200])!r}; is this the "
+                "address of an OpenAI-compatible API (it usually ends in /v1)?"
             )
         return answer, "", 0.0
 
@@ -236,8 +236,8 @@ class OpenAILLM:
         where = f"{self.name} at {self.base_url}"
         if _CONTEXT.search(problem) and status in (400, 413, 422):
             return ContextOverflowError(
-                f"{where}: the prompt does not fit ({problem}); shorten it (a memory with a smaller budget, a summary), "
-                "lower `max_tokens`, or use a model with a longer context"
+                f"{where}: the prompt does not fit ({problem}); shorten it (a memory with a smaller budget, a "
+                "summary), lower `max_tokens`, or use a model with a longer context"
             )
         remedies = {
             401: f"the API key is missing or wrong; set {self._key_env}",

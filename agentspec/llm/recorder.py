@@ -144,6 +144,10 @@ class ModuleLLM:
         """Ask the model for ``purpose``; keyword arguments override sampling fields (see :meth:`Recorder.generate`)."""
         return await self.recorder.generate(self.module, purpose, messages, **overrides)
 
+    def executed(self, call: LLMCall, completion: int = 0) -> None:
+        """Credit a completion that took effect outside a decision (a summary that became the context, say)."""
+        self.recorder.credit(call.id, completion, "executed")
+
     async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
         """Log-probabilities of ``continuations`` after the prompt (see :meth:`LLM.score`)."""
         return await self.recorder.llm.score(messages, continuations, episode=self.recorder.episode)

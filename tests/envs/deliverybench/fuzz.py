@@ -22,7 +22,17 @@ KEYS = [
     "item", "item_id", "items", "name", "bag_cmd", "cmd", "comp", "bus_id", "target_stop_id", "angle", "direction", "text",
     "kind", "self", "class",
 ]  # fmt: skip
-WRAPS = ["{}", " {} ", "```\n{}\n```", '{{"action": "{}"}}', '{{"action": {{"action_call": "{}"}}}}', "{};;", "{}\nmore", "say {}", "{{{}}}"]
+WRAPS = [
+    "{}",
+    " {} ",
+    "```\n{}\n```",
+    '{{"action": "{}"}}',
+    '{{"action": {{"action_call": "{}"}}}}',
+    "{};;",
+    "{}\nmore",
+    "say {}",
+    "{{{}}}",
+]
 
 
 def hostile_text(rng: random.Random) -> str:
@@ -30,7 +40,9 @@ def hostile_text(rng: random.Random) -> str:
     name = rng.choice([*HANDLERS, "FLY", "", "move", "Pick Up", "MOVE_TO", "BAG"])
     parts = []
     for _ in range(rng.randint(0, 4)):
-        value = rng.choice(HOSTILE) if rng.random() < 0.7 else repr(rng.choice([rng.randint(-5, 30), rng.random() * 1e4]))
+        value = (
+            rng.choice(HOSTILE) if rng.random() < 0.7 else repr(rng.choice([rng.randint(-5, 30), rng.random() * 1e4]))
+        )
         parts.append(f"{rng.choice(KEYS)}={value}" if rng.random() < 0.5 else value)
     text = f"{name}({', '.join(parts)})"
     if rng.random() < 0.15:
@@ -48,7 +60,11 @@ def sensible_text(rng: random.Random, city: City, state: State) -> str:
     order = state.orders.get(rng.choice(orders))
     spots = [poi.anchor for poi in city.pois if poi.kind not in ("building",)]
     if order is not None:
-        spots += [order.offer.pickup.anchor, order.offer.dropoff.anchor, order.offer.handoff or order.offer.dropoff.anchor] * 4
+        spots += [
+            order.offer.pickup.anchor,
+            order.offer.dropoff.anchor,
+            order.offer.handoff or order.offer.dropoff.anchor,
+        ] * 4
     spots += [p for p in (state.scooter.park, state.car.park if state.car else None) if p]
     x, y = rng.choice(spots)
     pace = rng.choice(["", "", ', pace="accel"', ', pace="decel"'])

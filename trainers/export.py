@@ -1,0 +1,280 @@
+"""A trained run as a folder that stands on its own.
+
+What training leaves is scattered: weights here or in the last checkpoint, optimiser states beside them, the scaffold in
+the run's manifest. An export holds what is needed to act again and nothing else: the PEFT adapter (or the merged model),
+the tokenizer with its chat template, and ``agentspec.json``, which says what the adapter belongs to and which scaffold
+it was trained in. Weights are safetensors throughout; nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
+from agentspec.registry import SpecError
+from agentspec.state import write_atomic
+from agentspec.trajectory import versions
+from trainers.runlog import RunLog
+
+MANIFEST = "agentspec.json"
+FORMAT = 1
+
+ADAPTER, ADAPTER_CONFIG = "adapter_model.safetensors", "adapter_config.json"
+MODEL_FILES = ("config.json", "generation_config.json", "model.safetensors.index.json", "model*.safetensors")
+TOKENIZER_FILES = (
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "special_tokens_map.json",
+    "added_tokens.json",
+    "chat_template.jinja",
+    "vocab.json",
+    "merges.txt",
+    "tokenizer.model",
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The weights of a run: the folder they lie in, and whether they are an adapter or a whole model."""
+
+    folder: Path
+    adapter: bool
+
+
+def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
+    """Write the trained policy of ``run`` to ``to``, whole or not at all.
+
+    Args:
+        run: output folder of training: its final model, else its last complete checkpoint.
+        to: folder to write; must not exist, or be empty.
+        merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
+            ``transformers`` reads the result. A run that trained all weights is a whole model either way.
+
+    Returns:
+        ``to``.
+
+    Raises:
+        SpecError: there are no weights in ``run``, or ``to`` holds something.
+        ModelNotFoundError: the base model that an adapter needs cannot be found.
+    """
+    run, to = Path(run), Path(to)
+    trained = find_trained(run)
+    if to.exists() and (not to.is_dir() or any(to.iterdir())):
+        raise SpecError(f"{to} exists and is not an empty folder; choose another one or remove it")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{to.name}-", dir=to.parent))
+    try:
+        base = _base(run, trained)
+        if trained.adapter and merge:
+            _merge(trained.folder, base, work)
+        else:
+            patterns = (ADAPTER, ADAPTER_CONFIG) if trained.adapter else MODEL_FILES
+            _copy(trained.folder, work, patterns)
+        _tokenizer(trained.folder, base, work)
+        manifest = _manifest(run, trained, base, work, merged=merge and trained.adapter)
+        write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+        os.chmod(work, 0o755)
+        os.replace(work, to)  # onto an empty folder or nothing
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return to
+
+
+def find_trained(run: Path) -> Trained:
+    """The final weights of a run, or those of its last complete checkpoint.
+
+    Raises:
+        SpecError: there is no such folder, or no safetensors weights in it.
+    """
+    if not run.is_dir():
+        raise SpecError(f"no run folder {run}; give the output_dir of a training run")
+    checkpoints = [(int(m.group(1)), p) for p in run.iterdir() if (m := re.fullmatch(r"checkpoint-(\d+)", p.name))]
+    # The trainer writes its state last: a checkpoint without it was cut short.
+    complete = [p for _, p in sorted(checkpoints, reverse=True) if (p / "trainer_state.json").is_file()]
+    for folder in (run, *complete):
+        if (folder / ADAPTER).is_file() and (folder / ADAPTER_CONFIG).is_file():
+            return Trained(folder, adapter=True)
+        single, sharded = folder / "model.safetensors", folder / "model.safetensors.index.json"
+        if (folder / "config.json").is_file() and (single.is_file() or sharded.is_file()):
+            return Trained(folder, adapter=False)
+    raise SpecError(
+        f"{run} holds no trained weights: neither {ADAPTER} nor model.safetensors, there or in a complete checkpoint; "
+        "let training reach a checkpoint (save_steps) or its end"
+    )
+
+
+def verify(folder: str | Path) -> list[str]:
+    """Files of an export that are missing or differ from its manifest (empty: it is as it was written).
+
+    Raises:
+        SpecError: the folder has no manifest.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        raise SpecError(f"{folder} has no {MANIFEST}; it was not written by `agentspec export`")
+    recorded = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["files"]
+    problems = []
+    for name, digest in recorded.items():
+        if not (folder / name).is_file():
+            problems.append(f"{name} is missing")
+        elif _sha256(folder / name) != digest:
+            problems.append(f"{name} was changed")
+    return problems
+
+
+def _base(run: Path, trained: Trained) -> ModelSource | None:
+    """The model an adapter belongs to: as the run's configuration names it, else as the adapter does."""
+    if not trained.adapter:
+        return None
+    named = _configured(run, "model")
+    recorded = json.loads((trained.folder / ADAPTER_CONFIG).read_text(encoding="utf-8")).get("base_model_name_or_path")
+    for name in (named, recorded):
+        if not name:
+            continue
+        try:
+            source = resolve(name)
+        except ModelNotFoundError:
+            if name == recorded or not recorded:
+                raise
+            continue
+        return ModelSource(source.path, name)
+    raise ModelNotFoundError(
+        f"neither {run / 'manifest.json'} nor the adapter says which model it was trained on; write its name into "
+        f"base_model_name_or_path of {trained.folder / ADAPTER_CONFIG}"
+    )
+
+
+def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
+    """Write base model + adapter as one model.
+
+    The sum is formed in single precision even for a half-precision base: rounding happens once, when saving.
+    """
+    import torch
+    from peft import PeftModel
+    from transformers import AutoModelForCausalLM
+
+    assert base is not None  # only adapters are merged
+    model = AutoModelForCausalLM.from_pretrained(base.path, dtype="auto")
+    dtype = model.dtype
+    model = PeftModel.from_pretrained(model.to(torch.float32), str(adapter), is_trainable=False)
+    merged = model.merge_and_unload(safe_merge=True).to(dtype)
+    merged.save_pretrained(to)
+
+
+def _tokenizer(folder: Path, base: ModelSource | None, to: Path) -> None:
+    """The run's tokenizer; the base model's where the run has none."""
+    if _copy(folder, to, TOKENIZER_FILES) or base is None:
+        return
+    from transformers import AutoTokenizer
+
+    AutoTokenizer.from_pretrained(base.path).save_pretrained(to)
+
+
+def _copy(source: Path, to: Path, patterns: Iterable[str]) -> int:
+    """Copy the files that match; how many there were."""
+    paths = {path for pattern in patterns for path in source.glob(pattern) if path.is_file()}
+    for path in paths:
+        shutil.copyfile(path, to / path.name)
+    return len(paths)
+
+
+def _manifest(run: Path, trained: Trained, base: ModelSource | None, work: Path, *, merged: bool) -> dict[str, Any]:
+    source = "final model" if trained.folder == run else trained.folder.name
+    name = base.name if base else _configured(run, "model") or ""
+    recorded = _run_manifest(run)
+    return {
+        "format": FORMAT,
+        "kind": "merged model" if merged else "adapter" if trained.adapter else "model",
+        "source": source,
+        "base_model": {"name": name, "path": base.path if base else "", "revision": _revision(base)},
+        "scaffold": recorded.get("spec") or _configured(run, "agent"),
+        "environment": _configured(run, "env"),
+        "template_sha256": _template_sha256(work),
+        "tokenizer_sha256": _sha256(work / "tokenizer.json") if (work / "tokenizer.json").is_file() else "",
+        "versions": {"export": versions() | _more_versions(), "training": recorded.get("versions", {})},
+        "rewards": reward_summary(RunLog(run).read("metrics.jsonl")),
+        "files": {path.name: _sha256(path) for path in sorted(work.iterdir())},
+    }
+
+
+def reward_summary(rows: Iterable[dict[str, Any]], *, key: str = "reward", window: int = 5) -> dict[str, Any]:
+    """The reward curve in a few numbers.
+
+    Returns:
+        ``steps`` (last logged step), ``first`` and ``last`` (means of the first and last ``window`` logged values),
+        ``best`` and ``best_step``; empty without a logged reward.
+    """
+    points = [(row["step"], float(row[key])) for row in rows if row.get(key) is not None and "step" in row]
+    if not points:
+        return {}
+    values = [value for _, value in points]
+    n = min(window, len(values))
+    best_step, best = max(points, key=lambda p: p[1])
+    return {
+        "steps": points[-1][0],
+        "first": sum(values[:n]) / n,
+        "last": sum(values[-n:]) / n,
+        "best": best,
+        "best_step": best_step,
+    }
+
+
+def _run_manifest(run: Path) -> dict[str, Any]:
+    path = run / "manifest.json"
+    if not path.is_file():
+        return {}
+    data = json.loads(path.read_text(encoding="utf-8"))
+    return data if isinstance(data, dict) else {}
+
+
+def _configured(run: Path, name: str) -> Any:
+    """A setting of the run, from its manifest."""
+    manifest = _run_manifest(run)
+    config = manifest.get("config")
+    return manifest.get(name) or (config.get(name) if isinstance(config, dict) else None)
+
+
+def _revision(base: ModelSource | None) -> str:
+    """The commit of a hub model, as its cached configuration records it; empty for a folder."""
+    if base is None or Path(base.path).is_dir():
+        return ""
+    from transformers import AutoConfig
+
+    return str(getattr(AutoConfig.from_pretrained(base.path), "_commit_hash", None) or "")
+
+
+def _template_sha256(folder: Path) -> str:
+    """Digest of the chat template, wherever this version of the library keeps it; empty without one."""
+    template = ""
+    if (folder / "chat_template.jinja").is_file():
+        template = (folder / "chat_template.jinja").read_text(encoding="utf-8")
+    elif (folder / "tokenizer_config.json").is_file():
+        config = json.loads((folder / "tokenizer_config.json").read_text(encoding="utf-8"))
+        template = config.get("chat_template") or ""
+    if not template:
+        return ""
+    text = template if isinstance(template, str) else json.dumps(template, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _more_versions() -> dict[str, str]:
+    from importlib import metadata
+
+    return {name: metadata.version(name) for name in ("peft", "safetensors", "trl")}
+
+
+__all__ = ["MANIFEST", "export", "find_trained", "reward_summary", "verify"]
