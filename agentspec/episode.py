@@ -310,7 +310,7 @@ class NoLLM:
     async def generate(self, request: Any) -> Any:
         raise LLMError(f"{request.tag.path} asked for a model, but none was configured; name one with `--model`")
 
-    async def score(self, messages: Any, continuations: Any) -> Any:
+    async def score(self, messages: Any, continuations: Any, *, episode: str = "") -> Any:
         raise LLMError("a module asked for scores, but no model was configured; name one with `--model`")
 
     def count_tokens(self, text: str) -> int:

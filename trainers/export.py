@@ -1,9 +1,9 @@
 """A trained run as a folder that stands on its own.
 
 What training leaves is scattered: weights here or in the last checkpoint, optimiser states beside them, the scaffold in
-the run's manifest. An export holds what is needed to act again and nothing else: the PEFT adapter (or the merged model),
-the tokenizer with its chat template, and ``agentspec.json``, which says what the adapter belongs to and which scaffold
-it was trained in. Weights are safetensors throughout; nothing is ever unpickled.
+the run's manifest. An export holds what is needed to act again and nothing else: the PEFT adapter (or the merged
+model), the tokenizer with its chat template, and ``agentspec.json``, which says what the adapter belongs to and which
+scaffold it was trained in. Weights are safetensors throughout; nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -79,6 +79,8 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
         else:
             patterns = (ADAPTER, ADAPTER_CONFIG) if trained.adapter else MODEL_FILES
             _copy(trained.folder, work, patterns)
+        if base is not None and not merge:
+            _name_base(work / ADAPTER_CONFIG, base)
         _tokenizer(trained.folder, base, work)
         manifest = _manifest(run, trained, base, work, merged=merge and trained.adapter)
         write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
@@ -132,25 +134,31 @@ def verify(folder: str | Path) -> list[str]:
 
 
 def _base(run: Path, trained: Trained) -> ModelSource | None:
-    """The model an adapter belongs to: as the run's configuration names it, else as the adapter does."""
+    """The model an adapter belongs to.
+
+    What the adapter itself says counts; the run's configuration knows the name it was asked for by, and stands in when
+    the adapter names nothing that exists here.
+    """
     if not trained.adapter:
         return None
-    named = _configured(run, "model")
     recorded = json.loads((trained.folder / ADAPTER_CONFIG).read_text(encoding="utf-8")).get("base_model_name_or_path")
-    for name in (named, recorded):
-        if not name:
-            continue
-        try:
-            source = resolve(name)
-        except ModelNotFoundError:
-            if name == recorded or not recorded:
-                raise
-            continue
-        return ModelSource(source.path, name)
-    raise ModelNotFoundError(
-        f"neither {run / 'manifest.json'} nor the adapter says which model it was trained on; write its name into "
-        f"base_model_name_or_path of {trained.folder / ADAPTER_CONFIG}"
-    )
+    sources: dict[str, str] = {}
+    errors: list[ModelNotFoundError] = []
+    for name in (recorded, _configured(run, "model")):
+        if name:
+            try:
+                sources[name] = resolve(name).path
+            except ModelNotFoundError as error:
+                errors.append(error)
+    if not sources:
+        if errors:
+            raise errors[0]
+        raise ModelNotFoundError(
+            f"neither {run / 'manifest.json'} nor the adapter says which model it was trained on; write its name into "
+            f"base_model_name_or_path of {trained.folder / ADAPTER_CONFIG}"
+        )
+    path = next(iter(sources.values()))
+    return ModelSource(path, [name for name, found in sources.items() if found == path][-1])
 
 
 def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
@@ -168,6 +176,12 @@ def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
     model = PeftModel.from_pretrained(model.to(torch.float32), str(adapter), is_trainable=False)
     merged = model.merge_and_unload(safe_merge=True).to(dtype)
     merged.save_pretrained(to)
+
+
+def _name_base(config: Path, base: ModelSource) -> None:
+    """Let the adapter's configuration name a base model that PEFT's own loaders find on this machine."""
+    data = json.loads(config.read_text(encoding="utf-8"))
+    write_atomic(config, json.dumps(data | {"base_model_name_or_path": base.path}, indent=2, sort_keys=True) + "\n")
 
 
 def _tokenizer(folder: Path, base: ModelSource | None, to: Path) -> None:

@@ -11,8 +11,8 @@ Rules:
 - A sampled turn that ends with an end-of-turn token is not given a second one by the template.
 - If the last message is the assistant's, its turn is continued: the prompt is that of the messages before it, with the
   generation prompt, followed by the parts of the turn.
-- A turn whose first part was sampled keeps the whole generation prompt it was sampled after, even where the template
-  writes a shorter header for past turns (an empty think block, for example).
+- A turn whose first part was sampled keeps the generation prompt it was sampled after, even where the template opens
+  past turns in another way (with or without an empty think block, for example).
 - Hence appending turns extends the earlier prompt and completion exactly, for every template that writes the turns
   before in the same way again. One that rewrites them gives a prompt that is no extension; nothing else breaks.
 - Special tokens in literal content (``<|im_end|>`` in what an environment says) are spelled out as ordinary text:
@@ -111,7 +111,7 @@ class ChatFormat:
         for i, piece in enumerate(literals):
             turn = turns[numbers[i]] if i < len(numbers) else None
             is_sampled = turn is not None and turn.content and isinstance(turn.content[0], Sampled)
-            encoded = self._encode_literal(piece + self._missing_header(piece) if is_sampled else piece)
+            encoded = self._encode_literal(self._opened(piece) if is_sampled else piece)
             ended = i > 0 and ids and ids[-1] in self.stop_ids and ids[-1:] == list(encoded[:1])
             ids.extend(encoded[1:] if ended else encoded)
             if turn is not None:
@@ -173,14 +173,19 @@ class ChatFormat:
     def _tokenize(self, text: str) -> tuple[int, ...]:
         return tuple(self.tokenizer.encode(text, add_special_tokens=False))
 
-    def _missing_header(self, literal: str) -> str:
-        """What the generation prompt has more than the header at the end of ``literal``."""
-        if literal.endswith(self._header):
-            return ""
-        for length in range(len(self._header) - 1, 0, -1):
-            if literal.endswith(self._header[:length]):
-                return self._header[length:]
-        return ""
+    def _opened(self, literal: str) -> str:
+        """``literal``, which opens an assistant turn, ending in the generation prompt that the turn was sampled after."""
+        if literal.endswith(self._header) or self._special is None:
+            return literal
+        for length in range(len(self._header), 0, -1):
+            anchor = self._header[:length]
+            # Only special tokens are sure to be the template's own: content cannot contain them.
+            if not self._special.search(anchor):
+                break
+            at = literal.rfind(anchor)
+            if at >= 0:
+                return literal[:at] + self._header
+        return literal
 
     def _accepts_system(self) -> bool:
         try:

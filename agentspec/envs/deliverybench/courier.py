@@ -36,11 +36,11 @@ class Style:
     `hasty` moves at the accelerated pace while nothing fragile is carried; `bagging` packs food into the bag.
     """
 
-    second: float = 0.06
+    second: float = 0.07
     idle: float = 0.01
-    metre: float = 0.002
-    call: float = 0.3
-    margin: float = 1.0
+    metre: float = 0.003
+    call: float = 0.4
+    margin: float = 1.5
     hasty: bool = True
     bagging: bool = True
     max_orders: int = 8
