@@ -24,7 +24,7 @@ train: install
 		--config recipes/configs/quickstart_cpu.yaml --output_dir $(RUN)
 
 test: install lint types
-	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-slow: install
 	$(BIN)/python -m pytest -q -m slow

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import functools
 import json
 import re
 from typing import Any
@@ -86,6 +87,8 @@ def parse_action(text: str, schema: ActionSchema) -> Action | ActionError:
 
 
 def _match_choice(text: str, schema: ActionSchema) -> str | None:
+    if not schema.choices:
+        return None
     wanted = " ".join(text.split()).casefold()
     return next((c for c in schema.choices if c.casefold() == wanted), None)
 
@@ -125,11 +128,17 @@ def _apply_units(text: str, schema: ActionSchema) -> str:
     """Multiply every ``number unit`` outside quotes by the unit's factor."""
     if not schema.units:
         return text
-    units = "|".join(re.escape(u) for u in sorted(schema.units, key=len, reverse=True))
-    pattern = re.compile(rf"(?<![\w.])(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+)\s*({units})\b")
+    pattern = _unit_pattern(tuple(schema.units))
     parts = _QUOTED.split(text)
     parts[::2] = [pattern.sub(lambda m: repr(float(m.group(1)) * schema.units[m.group(2)]), p) for p in parts[::2]]
     return "".join(parts)
+
+
+@functools.lru_cache(maxsize=32)
+def _unit_pattern(units: tuple[str, ...]) -> re.Pattern[str]:
+    """A number that is not part of a word, followed by one of ``units``."""
+    names = "|".join(re.escape(u) for u in sorted(units, key=len, reverse=True))
+    return re.compile(rf"(?<![\w.])(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+)\s*({names})\b")
 
 
 def _literal(node: ast.AST) -> Any:

@@ -6,6 +6,7 @@ assistant's turn into the context and turns an exhausted budget into a flagged d
 
 from __future__ import annotations
 
+import base64
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 from agentspec.context import Context
 from agentspec.llm.recorder import BudgetExceededError, Recorder
-from agentspec.protocols import Memory, Perception, Reasoning, Reflection, StepClock
+from agentspec.protocols import (
+    Measured,
+    Memory,
+    Perception,
+    Reasoning,
+    Reflection,
+    Services,
+    Simulator,
+    StepClock,
+)
+from agentspec.state import dump_state, load_state
 from agentspec.types import ActionError, AgentInput, Decision, Recall, Task, Transition
 
 if TYPE_CHECKING:
@@ -31,6 +42,12 @@ class Agent:
     context: Context
     clock: StepClock
     recorder: Recorder
+    services: tuple[Services, ...] = ()
+
+    def attach_simulator(self, simulator: Simulator | None) -> None:
+        """Give every module the environment for search (``None``: it has no snapshots)."""
+        for services in self.services:
+            services.simulator = simulator
 
     def begin_episode(self, task: Task) -> None:
         """Prepare every module for ``task``."""
@@ -73,3 +90,18 @@ class Agent:
         for module in (self.memory, self.reflection):
             with contextlib.suppress(BudgetExceededError):
                 await module.end_episode(trajectory)
+
+    def metrics(self) -> dict[str, Any]:
+        """Figures that modules add to the trajectory's, as ``reflection/...``, ``reasoning/...``, ``memory/...``."""
+        kinds = {"memory": self.memory, "reasoning": self.reasoning, "reflection": self.reflection}
+        measured = {kind: module.metrics() for kind, module in kinds.items() if isinstance(module, Measured)}
+        return {f"{kind}/{name}": value for kind, figures in measured.items() for name, value in figures.items()}
+
+    def carry(self) -> bytes:
+        """What outlives the episode under ``scope: run``: the state of memory and of reflection."""
+        return dump_state([base64.b64encode(m.snapshot()).decode() for m in (self.memory, self.reflection)])
+
+    def resume(self, blob: bytes) -> None:
+        """Take over what an earlier episode's agent carried."""
+        for module, state in zip((self.memory, self.reflection), load_state(blob), strict=True):
+            module.restore(base64.b64decode(state))

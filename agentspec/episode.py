@@ -21,20 +21,13 @@ from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
 from agentspec.registry import REGISTRY, SpecError
+from agentspec.simulator import OBJECTS_IN_INFO, EnvironmentFailedError, simulator_of
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, jsonable, versions
 from agentspec.types import Task, Transition
 
 T = TypeVar("T")
 MakeEnv = Callable[[Task], Any]
-
-OBJECTS_IN_INFO = ("instruction", "action_schema", "state", "metrics")
-"""Entries of ``info`` that a transition does not repeat: they stand in the agent's input or in the metrics."""
-
-
-class EnvironmentFailedError(RuntimeError):
-    """An environment crashed, hung or returned what no reward can be computed from."""
-
 
 def environment_id(name: str) -> str:
     """The gymnasium id of a registered short name (ids pass through)."""
@@ -70,6 +63,7 @@ class EnvWorker:
 
     def __init__(self, timeout: float | None) -> None:
         self.timeout = timeout
+        self._hung = ""
         self._jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
         threading.Thread(target=self._run, daemon=True, name="agentspec-env").start()
 
@@ -91,13 +85,16 @@ class EnvWorker:
         Raises:
             EnvironmentFailedError: it raised, or took longer than the time limit (seconds).
         """
+        if self._hung:
+            raise EnvironmentFailedError(f"{what} is not possible any more: {self._hung}")
         loop = asyncio.get_running_loop()
         future: asyncio.Future[T] = loop.create_future()
         self._jobs.put((function, future, loop))
         try:
             return await asyncio.wait_for(future, self.timeout)
         except TimeoutError:
-            raise EnvironmentFailedError(f"{what} took longer than {self.timeout} s") from None
+            self._hung = f"{what} took longer than {self.timeout} s"
+            raise EnvironmentFailedError(self._hung) from None
         except SpecError:
             raise
         except Exception as error:
@@ -197,13 +194,18 @@ class Runner:
 
     async def _play(self, job: Job, agent: Agent, worker: EnvWorker) -> Trajectory:
         if self.spec.scope == "run" and job.memory_state is not None:
-            agent.memory.restore(job.memory_state)
+            agent.resume(job.memory_state)
         transitions: list[Transition] = []
         info: dict[str, Any] = {}
         status, error, ended = "completed", "", "environment"
         env = None
         try:
             env = await worker.call("make", lambda: self.make_env(job.task))
+            simulator = simulator_of(env, worker, job.task, agent.perception)
+            if simulator is None:
+                who = f"environment {job.task.env!r} without snapshot() and restore()"
+                self.spec.check(frozenset(agent.recorder.llm.capabilities), who)
+            agent.attach_simulator(simulator)
             observation, info = await worker.call("reset", lambda: env.reset(seed=job.task.seed))
             agent.begin_episode(job.task)
             while not (transitions and (transitions[-1].terminated or transitions[-1].truncated)):
@@ -226,11 +228,9 @@ class Runner:
         metrics = {**jsonable(info.get("metrics", {})), **_scaffold_metrics(transitions, agent.recorder, ended)}
         trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         if status == "completed":
-            before = len(agent.recorder.calls)
             await agent.end_episode(trajectory)
-            if len(agent.recorder.calls) > before:
-                metrics |= _scaffold_metrics(transitions, agent.recorder, ended)
-                trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
+            metrics |= _scaffold_metrics(transitions, agent.recorder, ended) | jsonable(agent.metrics())
+            trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         return trajectory
 
     def _trajectory(
@@ -254,7 +254,7 @@ class Runner:
             status=status,
             error=error,
             versions=versions(),
-            memory_state=agent.memory.snapshot() if self.spec.scope == "run" else None,
+            memory_state=agent.carry() if self.spec.scope == "run" else None,
         )
 
 
@@ -290,6 +290,8 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "steps": steps,
         "return": sum(t.reward for t in transitions),
         "invalid_actions": sum(bool(t.info.get("invalid")) or not t.decision.valid for t in transitions),
+        "fallbacks": sum("fallback" in t.decision.trace for t in transitions),
+        "exhausted_searches": sum(bool(t.decision.trace.get("exhausted")) for t in transitions),
         "llm_calls": len(recorder.calls),
         "input_tokens": usage.input_tokens,
         "output_tokens": usage.output_tokens,

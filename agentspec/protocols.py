@@ -12,7 +12,7 @@ import itertools
 import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,36 @@ class StepClock:
         return self.step
 
 
+@dataclass(frozen=True)
+class Simulated:
+    """What one simulated step led to.
+
+    Args:
+        input: u_t of the state that was reached, as perception shows it.
+        reward: reward of the step.
+        ended: whether the episode would be over (terminated or truncated).
+        info: the environment's report of the step, without what already stands in ``input``.
+    """
+
+    input: AgentInput
+    reward: float
+    ended: bool
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Simulator(Protocol):
+    """The episode's own environment, for search: try steps, then go back.
+
+    Whoever uses it returns the environment to the exact state it found (``snapshot`` first, ``restore`` last).
+    """
+
+    async def snapshot(self) -> bytes: ...
+
+    async def restore(self, blob: bytes) -> None: ...
+
+    async def step(self, action: str) -> Simulated: ...
+
+
 @dataclass
 class Services:
     """What the scaffold injects into a module.
@@ -54,6 +84,7 @@ class Services:
         rng: the module's own generator, seeded by run, task, rollout and module.
         embedder: text embeddings, or ``None`` where the spec names no embedder.
         new_id: counter for ids, unique within the module.
+        simulator: the environment for search, or ``None`` where it has no snapshots.
     """
 
     llm: ModuleLLM
@@ -62,6 +93,7 @@ class Services:
     rng: random.Random
     embedder: Embedder | None = None
     new_id: Callable[[], int] = field(default_factory=lambda: itertools.count().__next__)
+    simulator: Simulator | None = None
 
 
 class Perception(Protocol):
@@ -110,3 +142,10 @@ class Reflection(Stateful, Protocol):
     async def revise(self, input: AgentInput, recall: Recall, decision: Decision) -> Decision: ...
 
     async def end_episode(self, trajectory: Trajectory) -> None: ...
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """A module that has figures of its own to add to the trajectory's metrics (JSON-like)."""
+
+    def metrics(self) -> Mapping[str, Any]: ...

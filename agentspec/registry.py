@@ -3,11 +3,16 @@
 One plain dict per kind. A target is ``"module:Class"`` and is imported only when it is built. Every entry declares its
 call profile (model calls per retrieve, store, step and episode) and what it needs of the backend, so that cost and
 capability are known before a run. ``register`` adds methods of your own.
+
+A method whose paper's settings are too dear for reinforcement learning has two cost presets, chosen by its parameter
+``preset``: ``paper`` (the default) and ``rl``. Both profiles are declared; the contract tests hold them against what is
+really called.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -22,7 +27,11 @@ class SpecError(ValueError):
 
 @dataclass(frozen=True)
 class CallProfile:
-    """Model calls as (fewest, most) per occasion under default parameters."""
+    """Model calls as (fewest, most) per occasion under the parameters of a preset.
+
+    A call is one request, whatever the number of samples it asks for. ``step`` is one decision (reasoning) or one
+    revision (reflection); ``episode`` is what happens at an episode's end.
+    """
 
     retrieve: tuple[int, int] = (0, 0)
     store: tuple[int, int] = (0, 0)
@@ -36,10 +45,13 @@ class Entry:
 
     Args:
         target: ``"package.module:Class"`` (for environments: the gymnasium id).
-        calls: the call profile.
+        calls: the call profile under default parameters (preset ``paper`` where there are presets).
         purposes: what its calls are for (the part of a call's path after ``/``); ``train`` patterns match these.
         needs: backend capabilities or ``"snapshots"`` of the environment.
         summary: one line for ``agentspec list``.
+        rl: the call profile of preset ``rl``; ``None`` for a method without presets.
+        waived: need -> (parameter, value): with that value the method does without the need.
+        envs: registered environments the method is written for; empty: any.
     """
 
     target: str
@@ -47,6 +59,19 @@ class Entry:
     purposes: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     summary: str = ""
+    rl: CallProfile | None = None
+    waived: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+    envs: tuple[str, ...] = ()
+
+    @property
+    def presets(self) -> dict[str, CallProfile]:
+        """Call profile by preset; empty for a method without presets."""
+        return {} if self.rl is None else {"paper": self.calls, "rl": self.rl}
+
+    def needs_with(self, params: Mapping[str, Any]) -> tuple[str, ...]:
+        """What the method needs when it is built with ``params``."""
+        waived = {need for need, (name, value) in self.waived.items() if params.get(name) == value}
+        return tuple(need for need in self.needs if need not in waived)
 
     def load(self) -> Any:
         """Import the target."""
@@ -60,6 +85,7 @@ class Entry:
             "calls": asdict(self.calls),
             "purposes": list(self.purposes),
             "needs": list(self.needs),
+            "presets": {name: asdict(profile) for name, profile in self.presets.items()},
         }
 
 
@@ -96,7 +122,7 @@ REGISTRY = Registry()
 
 
 def register(kind: Kind, name: str, target: str, summary: str, **declared: Any) -> None:
-    """Register ``name``; ``declared`` are ``calls``, ``purposes`` and ``needs`` of :class:`Entry`."""
+    """Register ``name``; ``declared`` are the other fields of :class:`Entry`."""
     REGISTRY.register(kind, name, Entry(target, summary=summary, **declared))
 
 
@@ -155,12 +181,99 @@ register(
     "rule_based",
     "agentspec.reasoning.rule_based:RuleBased",
     "the environment's scripted expert: no model, a baseline and demonstrator",
+    envs=("deliverybench",),
 )
 register(
     "reasoning",
     "random",
     "agentspec.reasoning.rule_based:RandomLegal",
     "a random sensible action: no model, the floor",
+    envs=("deliverybench",),
+)
+register(
+    "reasoning",
+    "plan_and_solve",
+    "agentspec.reasoning.plan_and_solve:PlanAndSolve",
+    "a plan of sub-goals that persists, then one sub-goal at a time; plans anew when it fails or is done",
+    calls=CallProfile(step=(1, 3)),
+    rl=CallProfile(step=(1, 2)),
+    purposes=("plan", "think", "act"),
+)
+register(
+    "reasoning",
+    "self_consistency",
+    "agentspec.reasoning.self_consistency:SelfConsistency",
+    "independent chains of thought, and a vote over their actions",
+    calls=CallProfile(step=(1, 6)),
+    rl=CallProfile(step=(1, 4)),
+    purposes=("think", "act"),
+    needs=("n",),
+)
+register(
+    "reasoning",
+    "mad",
+    "agentspec.reasoning.mad:MultiAgentDebate",
+    "agents answer, read each other's answers, answer again, and vote",
+    calls=CallProfile(step=(9, 18)),
+    rl=CallProfile(step=(4, 4)),
+    purposes=("argue", "act"),
+)
+register(
+    "reasoning",
+    "tot",
+    "agentspec.reasoning.tot:TreeOfThoughts",
+    "a tree of short action sequences: propose, judge, prune, breadth or depth first",
+    calls=CallProfile(step=(1, 20)),
+    rl=CallProfile(step=(1, 8)),
+    purposes=("propose", "value", "vote"),
+    needs=("n",),
+)
+register(
+    "reasoning",
+    "rap",
+    "agentspec.reasoning.rap:ReasoningViaPlanning",
+    "Monte-Carlo tree search with the model as world model and judge",
+    calls=CallProfile(step=(1, 91)),
+    rl=CallProfile(step=(1, 16)),
+    purposes=("propose", "world", "judge"),
+    needs=("n", "score"),
+    waived={"score": ("evaluation", "samples")},
+)
+register(
+    "reasoning",
+    "lats",
+    "agentspec.reasoning.lats:LanguageAgentTreeSearch",
+    "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
+    calls=CallProfile(step=(1, 1300)),
+    rl=CallProfile(step=(1, 20)),
+    purposes=("propose", "value", "reflect", "world"),
+    needs=("n", "snapshots"),
+    waived={"snapshots": ("world", "model")},
 )
 
 register("reflection", "none", "agentspec.reflection.none:NoReflection", "keeps every decision as it is")
+register(
+    "reflection",
+    "self_refine",
+    "agentspec.reflection.self_refine:SelfRefine",
+    "a critic's feedback on the action before it is executed, and another attempt, until it is content",
+    calls=CallProfile(step=(1, 6)),
+    rl=CallProfile(step=(1, 2)),
+    purposes=("feedback", "refine"),
+)
+register(
+    "reflection",
+    "reflexion",
+    "agentspec.reflection.reflexion:Reflexion",
+    "after a failed trial a lesson in words, shown in the next trials of the same task",
+    calls=CallProfile(episode=(0, 1)),
+    purposes=("reflect",),
+)
+register(
+    "reflection",
+    "retroformer",
+    "agentspec.reflection.retroformer:Retroformer",
+    "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
+    calls=CallProfile(episode=(0, 1)),
+    purposes=("reflect",),
+)

@@ -151,7 +151,11 @@ class AgentSpec:
 
     def needs(self) -> set[str]:
         """What the modules need of the backend and the environment, together."""
-        return {need for kind in MODULE_KINDS for need in REGISTRY.get(kind, getattr(self, kind).name).needs}
+        return {need for kind in MODULE_KINDS for need in self._needs_of(kind)}
+
+    def _needs_of(self, kind: str) -> tuple[str, ...]:
+        module: ModuleSpec = getattr(self, kind)
+        return REGISTRY.get(kind, module.name).needs_with(module.params)
 
     def check(self, capabilities: frozenset[str], who: str) -> None:
         """Refuse a backend that lacks what a module needs.
@@ -160,12 +164,14 @@ class AgentSpec:
             SpecError: naming the module, what it needs and the remedy.
         """
         for kind in MODULE_KINDS:
-            entry = REGISTRY.get(kind, getattr(self, kind).name)
-            missing = [n for n in entry.needs if n not in capabilities]
+            missing = [n for n in self._needs_of(kind) if n not in capabilities]
             if missing:
+                entry = REGISTRY.get(kind, getattr(self, kind).name)
+                waivers = [f"set `{p}: {v}`" for p, v in (entry.waived[n] for n in missing if n in entry.waived)]
+                remedy = " or ".join([*waivers, f"choose another {kind} module or {who.split(maxsplit=1)[0]}"])
                 raise SpecError(
                     f"{kind} {getattr(self, kind).name!r} needs {', '.join(missing)}, which {who} does not offer "
-                    f"(it offers {', '.join(sorted(capabilities))}); choose another {kind} module or backend"
+                    f"(it offers {', '.join(sorted(capabilities)) or 'nothing of the kind'}); {remedy}"
                 )
 
     def build(self, recorder: Recorder, *, embedder: Embedder | None = None) -> Any:
@@ -174,6 +180,7 @@ class AgentSpec:
 
         context, clock = Context(self.layout, self.max_turns), StepClock()
         modules: dict[str, Any] = {}
+        provided: list[Services] = []
         for kind in MODULE_KINDS:
             spec: ModuleSpec = getattr(self, kind)
             cls = REGISTRY.get(kind, spec.name).load()
@@ -182,10 +189,9 @@ class AgentSpec:
                 continue
             path = f"{kind}.{spec.name}"
             rng = random.Random(derive_seed(recorder.seed, path))
-            modules[kind] = cls(
-                Services(ModuleLLM(recorder, path), context, clock, rng, embedder=embedder), **spec.params
-            )
-        return Agent(context=context, clock=clock, recorder=recorder, **modules)
+            provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder=embedder))
+            modules[kind] = cls(provided[-1], **spec.params)
+        return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), **modules)
 
 
 _FIELDS = [f.name for f in dataclasses.fields(AgentSpec)]

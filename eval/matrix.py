@@ -22,15 +22,15 @@ from agentspec.actions import suggest
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
-from agentspec.registry import REGISTRY, SpecError
+from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, jsonable, write_trajectories
 from agentspec.types import Sampling, Task
 from eval.metrics import episode_row
 from eval.policies import Policy
 from eval.results import Results
+from eval.tasks import Tasks, task_sets
 
-Tasks = Sequence[Task] | Mapping[str, Sequence[Task]]
 MakeLLM = Callable[[Policy], LLM | None]
 
 GREEDY: Mapping[str, Any] = {"temperature": 0.0}
@@ -43,36 +43,39 @@ class Settings:
     Args:
         rollouts: episodes per task (they differ in the agent's own draws; averaged before intervals are taken).
         seed: seed of the evaluation; the same for all policies.
-        sampling: fields of :class:`~agentspec.types.Sampling` that replace those of every scaffold; default greedy.
+        sampling: fields of :class:`~agentspec.types.Sampling` that replace those of every scaffold; ``None``: greedy.
         concurrency: most episodes at once (``None``: all of a scaffold's).
         timeout_s: limit of one environment call, in seconds.
         max_steps: most steps of an episode, on top of the environment's own limit.
         prices: dollars per token, by model name.
         trajectories: keep every episode under ``trajectories/``.
         retry_failed: play cells again whose line says that they failed.
+        replace_stale: play cells again whose line is from another configuration (retrained weights, say) instead of
+            refusing them.
     """
 
     rollouts: int = 1
     seed: int = 0
-    sampling: Mapping[str, Any] = field(default_factory=lambda: GREEDY)
+    sampling: Mapping[str, Any] | None = None
     concurrency: int | None = None
     timeout_s: float | None = 60.0
     max_steps: int | None = None
     prices: Prices = field(default_factory=Prices)
     trajectories: bool = False
     retry_failed: bool = False
+    replace_stale: bool = False
 
     def __post_init__(self) -> None:
         if self.rollouts < 1:
             raise ValueError(f"rollouts must be at least 1, got {self.rollouts}")
         names = Sampling.__dataclass_fields__
-        for name in self.sampling:
+        for name in self.sampling or ():
             if name not in names:
                 raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
 
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
-        return replace(spec, sampling=replace(spec.sampling, **self.sampling))
+        return replace(spec, sampling=replace(spec.sampling, **(GREEDY if self.sampling is None else self.sampling)))
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ def evaluate(
     make_llm: MakeLLM | None = None,
     make_env: MakeEnv = make_env,
     on_row: Callable[[dict[str, Any]], None] | None = None,
+    **changes: Any,
 ) -> list[dict[str, Any]]:
     """Play policies x scaffolds x tasks and return one row per episode (see :func:`eval.metrics.episode_row`).
 
@@ -103,7 +107,9 @@ def evaluate(
         policies: rows of the matrix; names must differ.
         specs: scaffold by label: columns of the matrix.
         tasks: tasks, or several labelled sets of them (one table each); no task may stand in two sets.
-        out: folder of ``results.jsonl``; existing lines are kept and their cells not played again.
+        out: folder of ``results.jsonl``, or another ``.jsonl`` file; existing lines are kept and their cells not
+            played again.
+        settings: how to play; keyword arguments ``changes`` are fields of it that replace its own.
         make_llm: policy -> loaded backend; default: what the policy says. Called once per policy that has to play.
         make_env: task -> environment.
         on_row: told of every finished episode.
@@ -114,7 +120,7 @@ def evaluate(
         ModelNotFoundError: a policy's model does not exist. As any error of making an environment (an unknown name, a
             map that is not there), it is raised before anything is played.
     """
-    settings = settings or Settings()
+    settings = replace(settings or Settings(), **changes)
     sets = task_sets(tasks)
     _check_names(policies, specs)
     results = Results(out)
@@ -124,10 +130,13 @@ def evaluate(
     ]
     playing = [[s for s in row if s.jobs] for row in plan]
     _check_first(playing, sets, make_llm, make_env)
+    results.discard(
+        (s.policy.name, s.scaffold, job.task.key, job.rollout) for row in playing for s in row for job in s.jobs
+    )
 
     def finished(setting: Setting, trajectory: Trajectory) -> None:
         if settings.trajectories:
-            write_trajectories(_trajectory_path(Path(out), setting, trajectory), [trajectory])
+            write_trajectories(_trajectory_path(results.trajectories, setting, trajectory), [trajectory])
         row = {
             "policy": setting.policy.name,
             "scaffold": setting.scaffold,
@@ -219,12 +228,14 @@ def _setting(
     left = []
     for job in every:
         row = results.by_cell.get((policy.name, label, job.task.key, job.rollout))
-        if row is not None and row.get("fingerprint") != fingerprint:
+        stale = row is not None and row.get("fingerprint") != fingerprint
+        if stale and not settings.replace_stale:
             raise SpecError(
                 f"{results.path} holds results of another configuration under policy {policy.name!r} and scaffold "
-                f"{label!r} (spec, weights, sampling or seed differ); choose another output folder or another label"
+                f"{label!r} (spec, weights, sampling or seed differ); choose another output folder or label, or "
+                "replace them (replace_stale)"
             )
-        if row is None or (settings.retry_failed and row["status"] == "failed"):
+        if row is None or stale or (settings.retry_failed and row["status"] == "failed"):
             left.append(job)
     if left and spec.scope == "run":
         left = every  # memory that runs on cannot be entered in the middle
@@ -257,38 +268,8 @@ def _check_first(
         make_env(task).close()
 
 
-def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
-    """Labelled sets of tasks; a plain sequence is split by environment and options.
-
-    Raises:
-        SpecError: no task at all, or one task given twice.
-    """
-    if isinstance(tasks, Mapping):
-        sets = {label: list(members) for label, members in tasks.items()}
-    else:
-        groups: dict[str, list[Task]] = {}
-        for task in tasks:
-            groups.setdefault(replace(task, seed=0).key, []).append(task)
-        sets = {}
-        names = [environment_name(members[0].env) for members in groups.values()]
-        for name, members in zip(names, groups.values(), strict=True):
-            options = " ".join(f"{k}={v}" for k, v in members[0].options.items()) if names.count(name) > 1 else ""
-            label = f"{name} {options}".strip()
-            sets[label if label not in sets else f"{label} ({members[0].split})"] = members
-    keys = [task.key for members in sets.values() for task in members]
-    if not keys or len(set(keys)) < len(keys):
-        problem = "no tasks" if not keys else f"{len(keys) - len(set(keys))} of {len(keys)} tasks are given twice"
-        raise SpecError(f"{problem}; give each task (environment, options, seed) exactly once")
-    return sets
-
-
-def environment_name(env: str) -> str:
-    """The registered short name of an environment, or its id."""
-    return next((name for name, entry in REGISTRY.entries.get("env", {}).items() if entry.target == env), env)
-
-
-def _trajectory_path(out: Path, setting: Setting, trajectory: Trajectory) -> Path:
-    folder = out / "trajectories" / _slug(setting.policy.name) / _slug(setting.scaffold)
+def _trajectory_path(folder: Path, setting: Setting, trajectory: Trajectory) -> Path:
+    folder = folder / _slug(setting.policy.name) / _slug(setting.scaffold)
     return folder / f"{trajectory.task.key}-{trajectory.rollout}.jsonl"
 
 

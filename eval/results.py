@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from agentspec.state import write_atomic
 from agentspec.trajectory import jsonable
 
 Cell = tuple[str, str, str, int]
@@ -23,18 +24,26 @@ def cell_of(row: Mapping[str, Any]) -> Cell:
     return row["policy"], row["scaffold"], row["task"], int(row["rollout"])
 
 
+def _line(row: Mapping[str, Any]) -> str:
+    return json.dumps(row, sort_keys=True, ensure_ascii=False) + "\n"
+
+
 class Results:
-    """Rows in ``folder/results.jsonl`` by cell; a later line about the same cell counts.
+    """Rows by cell, and the file they are kept in.
 
     Args:
-        folder: of the evaluation; made when the first row is appended.
+        out: the file if it ends in ``.jsonl``, else a folder in which it is ``results.jsonl``. Made when the first row
+            is appended.
 
     Raises:
         ValueError: a line that is not a row of results, with its number.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.path = Path(folder) / "results.jsonl"
+    def __init__(self, out: str | Path) -> None:
+        out = Path(out)
+        is_file = out.suffix == ".jsonl"
+        self.path = out if is_file else out / "results.jsonl"
+        self.trajectories = (out.with_suffix("") if is_file else out) / "trajectories"
         self.by_cell: dict[Cell, dict[str, Any]] = {}
         if self.path.is_file():
             self._read()
@@ -49,10 +58,18 @@ class Results:
         data = jsonable(row)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(data, sort_keys=True, ensure_ascii=False) + "\n")
+            file.write(_line(data))
             file.flush()
             os.fsync(file.fileno())
         self.by_cell[cell_of(data)] = data
+
+    def discard(self, cells: Iterable[Cell]) -> None:
+        """Drop the rows of ``cells``, on disk too: they are about to be played again."""
+        unwanted = set(cells) & self.by_cell.keys()
+        if not unwanted:
+            return
+        self.by_cell = {cell: row for cell, row in self.by_cell.items() if cell not in unwanted}
+        write_atomic(self.path, "".join(_line(row) for row in self.by_cell.values()))
 
     def _read(self) -> None:
         blob = self.path.read_bytes()

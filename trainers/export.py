@@ -84,7 +84,7 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
         _tokenizer(trained.folder, base, work)
         manifest = _manifest(run, trained, base, work, merged=merge and trained.adapter)
         write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-        os.chmod(work, 0o755)
+        _make_readable(work)
         os.replace(work, to)  # onto an empty folder or nothing
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -178,6 +178,13 @@ def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
     merged.save_pretrained(to)
 
 
+def _make_readable(folder: Path) -> None:
+    """Ordinary permissions: temporary folders, and some writers' files, are private."""
+    folder.chmod(0o755)
+    for path in folder.iterdir():
+        path.chmod(0o644)
+
+
 def _name_base(config: Path, base: ModelSource) -> None:
     """Let the adapter's configuration name a base model that PEFT's own loaders find on this machine."""
     data = json.loads(config.read_text(encoding="utf-8"))
@@ -211,7 +218,7 @@ def _manifest(run: Path, trained: Trained, base: ModelSource | None, work: Path,
         "source": source,
         "base_model": {"name": name, "path": base.path if base else "", "revision": _revision(base)},
         "scaffold": recorded.get("spec") or _configured(run, "agent"),
-        "environment": _configured(run, "env"),
+        "environment": _configured(run, "environment"),
         "template_sha256": _template_sha256(work),
         "tokenizer_sha256": _sha256(work / "tokenizer.json") if (work / "tokenizer.json").is_file() else "",
         "versions": {"export": versions() | _more_versions(), "training": recorded.get("versions", {})},

@@ -156,6 +156,8 @@ def enable_tree(model: nn.Module) -> None:
     def forward(self: Any, *args: Any, tree: Tree | None = None, wanted: Wanted | None = None, **kwargs: Any) -> Any:
         if tree is None or wanted is None:
             return original(*args, **kwargs)
+        for name in ("attention_mask", "labels", "inputs_embeds", "use_cache"):
+            kwargs.pop(name, None)  # wrappers (PEFT) pass these along as None
         # A four-dimensional mask is passed on untouched: no (N, N) mask is built, and ours does not read it.
         nothing = torch.empty(1, 1, 1, 1, device=wanted.before.device)
         hidden = self.base_model(*args, attention_mask=nothing, use_cache=False, tree=tree, **kwargs)

@@ -61,6 +61,9 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--out", required=True, metavar="DIR", help="folder of results; a stopped run goes on there")
     group.add_argument("--trajectories", action="store_true", help="keep every episode")
     group.add_argument("--retry-failed", action="store_true", help="play episodes again that failed")
+    group.add_argument(
+        "--replace-stale", action="store_true", help="play episodes again whose policy or scaffold has changed"
+    )
     group.add_argument("--plot", action="store_true", help="write matrix.png")
     group.add_argument("--json", action="store_true", help="print the summary as JSON instead of tables")
     parser.set_defaults(command=run)
@@ -68,20 +71,20 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Play what is left to play, write the report and print it; exit code 1 if no episode could be scored."""
-    from eval.matrix import GREEDY, Settings, evaluate
+    from eval.matrix import Settings, evaluate
     from eval.tables import markdown, summarise, write_report
 
-    sampling = key_values(arguments.sampling, "--sampling")
     settings = Settings(
         rollouts=arguments.rollouts,
         seed=arguments.seed,
-        sampling=sampling or GREEDY,
+        sampling=key_values(arguments.sampling, "--sampling") or None,
         concurrency=arguments.concurrency,
         timeout_s=arguments.timeout,
         max_steps=arguments.max_steps,
         prices=load_prices(arguments.prices),
         trajectories=arguments.trajectories,
         retry_failed=arguments.retry_failed,
+        replace_stale=arguments.replace_stale,
     )
     options = environment_options(arguments)
     tasks = [Task(arguments.env, seed, options, "test") for seed in parse_seeds(arguments.seeds)]

@@ -58,18 +58,19 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play, print, write; exit code 1 if an episode failed."""
     from agentspec.cli.frames import Film
-    from agentspec.episode import Job, Runner, make_env
+    from agentspec.episode import Job, Runner, environment_id, make_env
 
     if arguments.episodes < 1:
         raise SpecError(f"--episodes is {arguments.episodes}; expected at least 1")
+    environment_id(arguments.env)  # a mistyped name is told before anything else
     policy, spec = agent(arguments)
+    if policy:
+        policy.check()
     options = environment_options(arguments)
     tasks = [Task(arguments.env, arguments.seed + i, options, "test") for i in range(arguments.episodes)]
     # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
     make_env(tasks[0]).close()
     film = Film(arguments.gif, tasks[0]) if arguments.gif else None
-    if policy:
-        policy.check()
     runner = Runner(
         spec,
         policy.build() if policy else None,

@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from agentspec.actions import suggest
-from agentspec.llm.base import LLM
+from agentspec.llm.base import LLM, LLMError
 
 _BACKENDS = {
-    "local": ("agentspec.llm.local", "LocalLLM.load", "name_or_path"),
-    "openai": ("agentspec.llm.openai", "OpenAILLM", "model"),
-    "scripted": ("agentspec.llm.scripted", "ScriptedLLM", "script"),
+    "local": ("agentspec.llm.local", "LocalLLM.load", "name_or_path", "agentspec[train]"),
+    "openai": ("agentspec.llm.openai", "OpenAILLM", "model", "agentspec[openai]"),
+    "scripted": ("agentspec.llm.scripted", "ScriptedLLM", "script", "agentspec"),
 }
 # A spec is recorded with every run; a secret must not be in it.
 _SECRET = "api_key"
@@ -37,8 +37,13 @@ def build_llm(config: Mapping[str, Any]) -> LLM:
     backend = config.get("backend", "local")
     if backend not in _BACKENDS:
         raise ValueError(f"unknown llm backend {backend!r}{suggest(str(backend), _BACKENDS)}")
-    module, path, main = _BACKENDS[backend]
-    make: Any = importlib.import_module(module)
+    module, path, main, extra = _BACKENDS[backend]
+    try:
+        make: Any = importlib.import_module(module)
+    except ImportError as error:
+        raise LLMError(
+            f"the llm backend {backend!r} cannot be imported ({error}); run `pip install {extra}`"
+        ) from error
     for part in path.split("."):
         make = getattr(make, part)
     main_key = "script" if backend == "scripted" else "model"

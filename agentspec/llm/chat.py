@@ -174,9 +174,11 @@ class ChatFormat:
         return tuple(self.tokenizer.encode(text, add_special_tokens=False))
 
     def _opened(self, literal: str) -> str:
-        """``literal``, which opens an assistant turn, ending in the generation prompt that the turn was sampled after."""
+        """``literal``, which opens an assistant turn, ending in the generation prompt the turn was sampled after."""
         if literal.endswith(self._header) or self._special is None:
             return literal
+        if literal.rstrip().endswith(self._header):
+            return literal.rstrip()
         for length in range(len(self._header), 0, -1):
             anchor = self._header[:length]
             # Only special tokens are sure to be the template's own: content cannot contain them.
@@ -240,4 +242,4 @@ def _alternatives(tokens: list[str]) -> re.Pattern[str] | None:
 
 
 def _name(tokenizer: Any) -> str:
-    return str(getattr(tokenizer, "name_or_path", "") or type(tokenizer).__name__)
+    return str(getattr(tokenizer, "name_or_path", "") or tokenizer.__class__.__name__)

@@ -49,7 +49,7 @@ class Engine:
         self._stop_ids = stop_ids
         self._decode = decode
         self._max_batch = max_batch
-        self._weights: tuple[int, int] | None = None
+        self._weights: tuple[int, int, str] | None = None
 
     def run(self, jobs: Sequence[Job]) -> None:
         """Fill in ``completions`` or ``scores``, and ``cached``, of every job."""
@@ -130,9 +130,11 @@ class Engine:
                 row.job.completions += (row.completion(),)
 
     def _forget_old_weights(self) -> None:
-        """Drop the cache when an optimiser has written to the weights since the last call."""
-        parameters = list(self.model.model.parameters())
-        weights = (sum(p._version for p in parameters), sum(p.data_ptr() for p in parameters))
+        """Drop the cache when the weights were written to, or another adapter chosen, since the last call."""
+        model = self.model.model
+        parameters = [p for p in model.parameters() if not p.is_inference()]
+        adapter = str(getattr(model, "active_adapter", ""))
+        weights = (sum(p._version for p in parameters), sum(p.data_ptr() for p in parameters), adapter)
         if self._weights not in (None, weights):
             self.cache.clear()
         self._weights = weights

@@ -27,6 +27,7 @@ from agentspec.llm.base import LLMError
 from agentspec.llm.local_cache import Slot
 
 _ATTENTION = "agentspec_packed"
+_LAYER_TYPES = frozenset({"full_attention", "sliding_attention", "attention"})
 _ACTIVE = threading.local()
 
 
@@ -72,10 +73,12 @@ class PackedModel:
         self.config = base.config
         parameters = inspect.signature(base.forward).parameters
         text = self.config.get_text_config() if hasattr(self.config, "get_text_config") else self.config
-        if "position_ids" not in parameters or getattr(base, "_is_stateful", False):
+        other = set(getattr(text, "layer_types", None) or ()) - _LAYER_TYPES
+        if "position_ids" not in parameters or getattr(base, "_is_stateful", False) or other:
             raise LLMError(
-                f"{type(base).__name__} cannot run in the local backend: it takes no position ids or keeps a recurrent "
-                "state; serve it (vLLM) and use the `openai` backend"
+                f"{type(base).__name__} cannot run in the local backend: it takes no position ids, keeps a recurrent state, "
+                f"or has layers other than full and sliding attention ({sorted(other) or 'none named'}); serve it "
+                "(vLLM) and use the `openai` backend"
             )
         self.layers = int(text.num_hidden_layers)
         self.max_context = int(getattr(text, "max_position_embeddings", None) or 1 << 30)

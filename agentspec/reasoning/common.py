@@ -8,16 +8,18 @@ it is free text that the parser reads.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
-from agentspec.actions import parse_action
-from agentspec.llm.base import Message
+from agentspec.actions import parse_action, suggest
+from agentspec.llm.base import Message, user
 from agentspec.protocols import Services
+from agentspec.registry import SpecError
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, Sampled, Task, Transition
 
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
 CALL_ANSWER = "Answer with exactly one action call and nothing else."
+ON_REQUEST = "What you are asked to write stands at the end of each message; write that and nothing else."
 
 _ACTION_LINE = re.compile(r"\baction[\s*`]*:[\s*`]*(\S[^\n]*)", re.IGNORECASE)
 
@@ -66,6 +68,70 @@ def last_action_line(text: str) -> str | None:
     """What follows the last ``Action:`` in ``text``; ``None`` if there is none."""
     found = _ACTION_LINE.findall(text)
     return found[-1].strip() if found else None
+
+
+def read_action(text: str, schema: ActionSchema) -> Action | ActionError:
+    """The action of a free answer: what follows its last ``Action:``, or the answer itself if it has no such line."""
+    line = last_action_line(text)
+    return parse_action(text if line is None else line, schema)
+
+
+def canonical(action: Action, schema: ActionSchema) -> Hashable:
+    """Equal for actions that mean the same, however they were written: the name, and the arguments by parameter."""
+    spec = schema.actions.get(action.name)
+    names = list(spec.parameters) if spec else []
+    arguments: dict[str, Any] = {str(names[i] if i < len(names) else i): a for i, a in enumerate(action.args)}
+    return (action.name.casefold(), repr(sorted({**arguments, **action.kwargs}.items())))
+
+
+def with_request(messages: Sequence[Message], request: str) -> tuple[Message, ...]:
+    """``messages`` with ``request`` at the end of the last user turn: all requests of a step share the rest."""
+    return (*messages[:-1], user(f"{messages[-1].text}\n\n{request}"))
+
+
+def clip(text: str, budget: int, services: Services, *, keep: str = "head") -> str:
+    """``text`` within ``budget`` tokens; what is too long loses its end (``keep="head"``) or its beginning."""
+    while (used := services.llm.count_tokens(text)) > budget and text:
+        room = min(len(text) - 1, len(text) * budget // used)
+        text = text[:room] if keep == "head" else text[len(text) - room :]
+    return text
+
+
+def settings(method: str, presets: Mapping[str, Mapping[str, Any]], preset: str, given: Mapping[str, Any]) -> Any:
+    """The parameters of ``preset``, replaced by those that were given (are not ``None``).
+
+    Raises:
+        SpecError: no such preset.
+    """
+    if preset not in presets:
+        raise SpecError(f"{method} has no preset {preset!r}{suggest(str(preset), presets)}")
+    chosen = dict(presets[preset])
+    for name, value in given.items():
+        if value is not None:
+            chosen[name] = value
+    return chosen
+
+
+def at_least(method: str, lowest: int, **values: int | None) -> None:
+    """Refuse counts that are too small (``None`` is no limit).
+
+    Raises:
+        SpecError: naming the parameter.
+    """
+    for name, value in values.items():
+        if value is not None and value < lowest:
+            raise SpecError(f"{method}: {name} must be at least {lowest}, got {value}")
+
+
+def one_of(method: str, **values: tuple[str, tuple[str, ...]]) -> None:
+    """Refuse a value that is none of its alternatives: ``name=(value, alternatives)``.
+
+    Raises:
+        SpecError: naming the parameter and what it may be.
+    """
+    for name, (value, allowed) in values.items():
+        if value not in allowed:
+            raise SpecError(f"{method}: {name} must be one of {', '.join(allowed)}; got {value!r}")
 
 
 def sampled(call: LLMCall, completion: int = 0) -> Sampled:

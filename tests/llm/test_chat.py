@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import resources
 from typing import Any
 
@@ -121,11 +122,26 @@ def test_tokenizer_without_template_gets_the_fallback():
     assert later.count(end) == 1
 
 
-@pytest.mark.parametrize("name", ["qwen2_5", "qwen3", "llama3", "phi3", "gemma", "deepseek_r1_distill", "glm4moe"])
+TEMPLATES = [
+    "qwen2_5",
+    "qwen3",
+    "qwen3_5_nothink",
+    "llama3",
+    "phi3",
+    "gemma",
+    "deepseek_r1_distill",
+    "glm4moe",
+    "gptoss",
+]
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
 def test_every_common_template_extends(name):
     tokenizer = tiny_tokenizer()
     tokenizer.bos_token = "<|endoftext|>"
     tokenizer.chat_template = template(name)
+    marks = set(re.findall(r"<[|｜][\w▁]+[|｜]>|<(?:start|end)_of_turn>", tokenizer.chat_template))
+    tokenizer.add_special_tokens({"additional_special_tokens": sorted(marks | {"<|im_start|>"})})
     messages: list[Message] = [system("Be brief."), user("one")]
     for turn in range(3):
         prompt = render(messages, tokenizer)

@@ -54,7 +54,7 @@ def write_run(run: Path, model: Any, base: Path, *, folder: str = "") -> None:
     model.save_pretrained(target)
     tiny_tokenizer().save_pretrained(target)
     (target / "optimizer.pt").write_bytes(b"never copied, never unpickled")
-    RunLog(run).manifest(config={"model": str(base), "env": {"name": "toy"}}, spec={"reasoning": "direct"})
+    RunLog(run).manifest(config={"model": str(base), "environment": {"name": "toy"}}, spec={"reasoning": "direct"})
     for step, reward in enumerate([1.0, 2.0, 6.0, 3.0], 1):
         RunLog(run).append("metrics.jsonl", {"step": step, "reward": reward})
     RunLog(run).append("metrics.jsonl", {"step": 4, "train_runtime": 1.0})
@@ -75,6 +75,7 @@ def test_live_exported_and_merged_models_agree(tmp_path: Path, base: Path) -> No
         tokenizer = AutoTokenizer.from_pretrained(folder)
         assert tokenizer.chat_template == tiny_tokenizer().chat_template
         assert tokenizer(TEXT)["input_ids"] == tiny_tokenizer()(TEXT)["input_ids"]
+        assert all(p.stat().st_mode & 0o777 == 0o644 for p in folder.iterdir())
         assert not [p for p in folder.iterdir() if p.suffix in (".pt", ".bin", ".pkl")]
 
 
@@ -129,7 +130,7 @@ def test_refusals(tmp_path: Path, base: Path) -> None:
     with pytest.raises(SpecError, match="no run folder"):
         export(tmp_path / "nowhere", tmp_path / "out")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SpecError, match="no trained weights.*save_steps"):
+    with pytest.raises(SpecError, match=r"no trained weights.*save_steps"):
         export(tmp_path / "empty", tmp_path / "out")
     write_run(tmp_path / "run", trained_model(base), base)
     (tmp_path / "full").mkdir()

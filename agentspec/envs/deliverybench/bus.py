@@ -13,6 +13,7 @@ terminal the first stop of the way back. ``Rules.odd_bus_line`` keeps both; othe
 from __future__ import annotations
 
 import math
+import threading
 from bisect import bisect_right
 from dataclasses import dataclass
 
@@ -75,6 +76,7 @@ class BusTimetable:
         self._line = Line(names, stops, points, at)
         self._cursor = 0
         self._direction = 1
+        self._lock = threading.Lock()
         self._ticks: list[int] = []
         self._phases: list[BusPhase] = []
         if stops:
@@ -95,15 +97,19 @@ class BusTimetable:
         i = bisect_right(self._ticks, tick) - 1
         while True:
             if i == len(self._phases):
-                self._next()
+                self._extend(self._ticks[-1])
             phase = self._phases[i]
             if phase.stopped and phase.stop == stop:
                 return max(tick, phase.tick)
             i += 1
 
     def _extend(self, tick: int) -> None:
-        while self._ticks[-1] <= tick:
-            self._next()
+        """Compute phases until one begins after ``tick``; worlds in several threads may share the timetable."""
+        if self._ticks[-1] > tick:
+            return
+        with self._lock:
+            while self._ticks[-1] <= tick:
+                self._next()
 
     def _next(self) -> None:
         last = self._phases[-1]

@@ -11,8 +11,9 @@ courier is a demonstration in either language.
 from __future__ import annotations
 
 import json
+import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,11 +23,12 @@ from agentspec.envs.deliverybench.citymap import City
 from agentspec.envs.deliverybench.errands import Upkeep
 from agentspec.envs.deliverybench.geometry import polyline_length
 from agentspec.envs.deliverybench.menu import Option, best_offers, options
-from agentspec.envs.deliverybench.planning import DROPOFF, PICKUP, Job, Planner, Point, Stop
+from agentspec.envs.deliverybench.planning import PICKUP, Job, Planner, Point, Stop
 from agentspec.envs.deliverybench.view import IN_BAG, IN_HAND, READY
 
 MEMO_LIMIT = 100_000
-REST_OF_SHIFT = 'WAIT({:.1f})'
+CHARGING_PAYS_S = 600.0
+REST_OF_SHIFT = "WAIT({:.1f})"
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class RuleBasedCourier:
         self.city = city
         self.style = style or Style()
         self.round: list[Stop] = []
-        self._memo: dict[tuple[bool, Point, Point], float] = {}
+        self._memo: tuple[dict[tuple[Point, Point], float], dict[tuple[Point, Point], float]] = ({}, {})
 
     # -- the interface -----------------------------------------------------------------------------------------
 
@@ -117,12 +119,16 @@ class RuleBasedCourier:
         room = min(self.style.max_orders - len(view["orders"]), 99 if view["room"] is None else view["room"])
         if room <= 0:
             return []
-        offers = [self._job(offer) for offer in view["offers"]]
-        taken, plan = planner.choose(start, self.round, offers, room, self.style.margin)
+        return self._choose(planner, start, view["offers"], room)
+
+    def _choose(self, planner: Planner, start: Point, offers: Sequence[Mapping[str, Any]], room: int) -> list[int]:
+        """Ids of the offers to take, in order of choice; the round then serves them."""
+        jobs = [self._job(offer) for offer in offers]
+        taken, plan = planner.choose(start, self.round, jobs, room, self.style.margin)
         if not taken and not plan:
             # Idle time is worth little: with nothing to do, any order that pays for its way is welcome.
-            planner = replace(planner, second=0.3 * planner.second, idle=0.0, call=0.3 * planner.call)
-            taken, plan = planner.choose(start, plan, offers, room, 0.0)
+            planner = replace(planner, second=0.2 * planner.second, idle=0.0, call=0.2 * planner.call)
+            taken, plan = planner.choose(start, plan, jobs, room, 0.0)
         self.round = plan
         return taken
 
@@ -166,7 +172,7 @@ class RuleBasedCourier:
             start, delay = _point(rental["xy"]), rental["m"] / view["speed"]
         metre = style.metre if driving else style.metre + 0.004
         planner = Planner(
-            metres=lambda a, b: self._metres(driving, a, b),
+            metres=self._ways(driving),
             speed=speed * (1.1 if style.hasty else 1.0),
             second=style.second,
             idle=style.idle,
@@ -174,6 +180,8 @@ class RuleBasedCourier:
             call=style.call,
             delay=delay,
             horizon=view["left_s"] - 5.0,
+            actions=math.inf if view["calls_left"] is None else view["calls_left"],
+            per_pickup=2 if style.bagging else 1,
         )
         return start, planner
 
@@ -193,15 +201,23 @@ class RuleBasedCourier:
         )
 
     def _metres(self, driving: bool, a: Point, b: Point) -> float:
-        key = (driving, a, b)
-        found = self._memo.get(key)
-        if found is None:
-            if len(self._memo) >= MEMO_LIMIT:
-                self._memo.clear()
-            route = self.city.car_route if driving else self.city.walk_route
-            points = route((a[0] * 100.0, a[1] * 100.0), (b[0] * 100.0, b[1] * 100.0))
-            found = self._memo[key] = polyline_length(points) / 100.0
-        return found
+        return self._ways(driving)(a, b)
+
+    def _ways(self, driving: bool) -> Callable[[Point, Point], float]:
+        """The length of the way between two points (metres), by car or not; looked up where it is known."""
+        memo = self._memo[driving]
+        if len(memo) >= MEMO_LIMIT:
+            memo.clear()
+        route = self.city.car_route if driving else self.city.walk_route
+
+        def metres(a: Point, b: Point) -> float:
+            found = memo.get((a, b))
+            if found is None:
+                points = route((a[0] * 100.0, a[1] * 100.0), (b[0] * 100.0, b[1] * 100.0))
+                found = memo[a, b] = polyline_length(points) / 100.0
+            return found
+
+        return metres
 
     # -- the menu ----------------------------------------------------------------------------------------------
 
@@ -209,6 +225,7 @@ class RuleBasedCourier:
         """The next option of the menu."""
         menu = {option.text: option for option in options(view)}
         start, planner = self._planner(view, car=False)
+        planner.per_offer = 1
         _, self.round = planner.build(start, [self._job(order) for order in view["orders"]], self.round)
         for text in self._wishes(view, planner, start, menu):
             if text in menu:
@@ -221,19 +238,26 @@ class RuleBasedCourier:
         if view["charging"] is not None:
             first.append("wait for charging")
         first += ["charge to 80%", "ride scooter"]
-        offered = [self._job(o) for o in best_offers(view) if f"accept order {o['id']}" in menu]
-        taken, plan = planner.choose(start, self.round, offered, 1, self.style.margin)
-        if taken:
-            first.append(f"accept order {taken[0]}")
-            self.round = plan
-        if view["mode"] != "car":
-            leg = self._metres(False, start, self.round[0].place) if self.round else 0.0
-            if leg > view["range_m"] - 30.0 or view["range_m"] < 250.0:
-                first.append("go to charger")
+        offered = [offer for offer in best_offers(view) if f"accept order {offer['id']}" in menu]
+        taken = self._choose(planner, start, offered, len(offered)) if offered else []
+        first += [f"accept order {number}" for number in taken[:1]]
+        if view["mode"] != "car" and view["range_m"] < self._range_needed(start, view["left_s"]) + 30.0:
+            first.append("go to charger")
         for stop in self.round:
             place = "pickup" if stop.kind == PICKUP else "drop-off"
             first += [f"go to {place} of order {stop.job}", f"wait for order {stop.job}"]
         return [*first, "go to scooter", "go to rest area"]
+
+    def _range_needed(self, start: Point, left_s: float) -> float:
+        """Metres to the next stop of the round, and from there to a charger while charging can still pay."""
+        if not self.round:
+            return 0.0
+        goal = self.round[0].place
+        leg = self._metres(False, start, goal)
+        station = self.city.nearest("charging_station", (goal[0] * 100.0, goal[1] * 100.0))
+        if station is None or left_s < CHARGING_PAYS_S:
+            return leg
+        return leg + self._metres(False, goal, _metres_of(station[0].anchor))
 
 
 class RandomCourier:
@@ -253,9 +277,22 @@ class RandomCourier:
             return self.rng.choice(choices)
         return self.rng.choice(options(info["state"])).call
 
+    def snapshot(self) -> bytes:
+        """The state of the generator, for `restore`."""
+        return json.dumps(self.rng.getstate()).encode()
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`."""
+        version, internal, gauss = json.loads(blob)
+        self.rng.setstate((version, tuple(internal), gauss))
+
 
 def _point(xy: Sequence[float]) -> Point:
     return (xy[0], xy[1])
 
 
-__all__ = ["DROPOFF", "PICKUP", "RandomCourier", "RuleBasedCourier", "Style"]
+def _metres_of(point: Point) -> Point:
+    return (point[0] / 100.0, point[1] / 100.0)
+
+
+__all__ = ["RandomCourier", "RuleBasedCourier", "Style"]

@@ -1,9 +1,9 @@
 """Keeping a courier going: vehicle, battery and energy.
 
 The economics decide. A rented car costs a dollar a minute, drives twice as fast as the scooter and needs no battery; a
-battery pack is 2.5 km for ten dollars at once, a charger the same for five dollars and thirteen minutes; an energy drink
-is 50 % for six dollars at once, a rest area the same for nothing and seven minutes. While orders are worth more than
-ten dollars a kilometre, time is dearer than any of these.
+battery pack is 2.5 km for ten dollars at once, a charger the same for five dollars and thirteen minutes; an energy
+drink is 50 % for six dollars at once, a rest area the same for nothing and seven minutes. While orders are worth more
+than ten dollars a kilometre, time is dearer than any of these.
 """
 
 from __future__ import annotations

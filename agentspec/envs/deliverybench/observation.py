@@ -1,9 +1,10 @@
 """What the agent reads: a static instruction and a dynamic text, in a full and a compact form.
 
-The instruction holds everything that never changes within a task (role, goal, rules of thumb, prices, the map's places),
-so that the prompts of all steps share it as a prefix. The text holds what changes. The full text has the sections of
-the benchmark's observation: clock and courier, orders, hand and bag, orders on offer (after VIEW_ORDERS), surroundings,
-recent actions, last error, notices. The compact text says the same in a few lines, for small models and long episodes.
+The instruction holds everything that never changes within a task (role, goal, rules of thumb, prices, the map's
+places), so that the prompts of all steps share it as a prefix. The text holds what changes. The full text has the
+sections of the benchmark's observation: clock and courier, orders, hand and bag, orders on offer (after VIEW_ORDERS),
+surroundings, recent actions, last error, notices. The compact text says the same in a few lines, for small models and
+long episodes.
 
 Both are written from the view of `view.describe` alone.
 """
@@ -184,7 +185,8 @@ def _hand_and_bag(view: View) -> str:
     for label, compartment in view["bag"].items():
         if compartment["items"]:
             items = ", ".join(
-                f"{label}.{i} {item['name']} {item['temp']:.0f}C" for i, item in enumerate(compartment["items"], start=1)
+                f"{label}.{i} {item['name']} {item['temp']:.0f}C"
+                for i, item in enumerate(compartment["items"], start=1)
             )
             lines.append(f"{label} ({compartment['air']:.0f}C): {items}")
     return _listing("Hands and bag", lines, "empty")
@@ -198,9 +200,9 @@ def _offers(view: View) -> str:
         foods = ", ".join(f"{name} {calls.FOODS[name].serving:g}C" for name in offer["items"])
         note = f' Note: "{offer["note"]}"' if offer["note"] else ""
         lines.append(
-            f"order {offer['id']}: ${offer['pay']:.2f}, {offer['distance_m']}m, {math.ceil(offer['limit_s'] / 60.0)} min. "
-            f"From {offer['pickup']} {_at(offer['pickup_xy'])} {offer['pickup_road']} ({offer['to_pickup_m']}m from you) "
-            f"to {_at(offer['dropoff_xy'])} {offer['dropoff_road']}. {foods}.{note}"
+            f"order {offer['id']}: ${offer['pay']:.2f}, {offer['distance_m']}m, {_minutes(offer['limit_s'])} min. "
+            f"From {offer['pickup']} {_at(offer['pickup_xy'])} {offer['pickup_road']} "
+            f"({offer['to_pickup_m']}m from you) to {_at(offer['dropoff_xy'])} {offer['dropoff_road']}. {foods}.{note}"
         )
     return _listing("Orders on offer", lines, "none")
 
@@ -261,7 +263,9 @@ def _compact_order(order: Card, native: bool) -> str:
         status = f"ready in {_minutes(order['ready_in_s'])} min"
     picked = order["status"] in (IN_HAND, IN_BAG)
     goal = "drop-off" if picked else "pickup"
-    xy, way = (calls.handover(order)[1], order["to_dropoff_m"]) if picked else (order["pickup_xy"], order["to_pickup_m"])
+    xy, way = (
+        (calls.handover(order)[1], order["to_dropoff_m"]) if picked else (order["pickup_xy"], order["to_pickup_m"])
+    )
     where = f" {_at(xy)}" if native else ""
     text = f"order {order['id']}: {status}, {goal}{where} {way}m, {left} min, ${order['pay']:.2f}"
     if native and order["status"] == IN_HAND:
@@ -287,7 +291,7 @@ def _compact_care(view: View) -> list[str]:
     if view["energy"] <= 40.0:
         wanted += ["rest_area", "store"]
     places = [view["nearest"][kind] for kind in wanted if kind in view["nearest"]]
-    return [f"near: {'; '.join(f'{p["name"]} {_at(p["xy"])} {p["m"]}m' for p in places)}"] if places else []
+    return ["near: " + "; ".join(f"{p['name']} {_at(p['xy'])} {p['m']}m" for p in places)] if places else []
 
 
 # -- wording -----------------------------------------------------------------------------------------------------------
@@ -298,7 +302,8 @@ def _listing(title: str, lines: Sequence[str], empty: str) -> str:
 
 
 def _at(xy: Sequence[float]) -> str:
-    return f"({xy[0]:.1f}m, {xy[1]:.1f}m)"
+    # Adding zero turns -0.0 into 0.0.
+    return f"({round(xy[0], 1) + 0.0:.1f}m, {round(xy[1], 1) + 0.0:.1f}m)"
 
 
 def _clock(seconds: float) -> str:

@@ -1,18 +1,21 @@
 """Which orders to take and in which sequence to serve them: an insertion heuristic for the courier's round.
 
 A round is a sequence of stops, each the pick-up or the drop-off of one order. Its worth is what the deliveries pay, by
-the settlement's own rules for lateness, less the value of the time and the ways it takes. A new order is worth taking if
-the round with its two stops inserted at their best places is worth more than the round without. The value of a second
-is what a good courier earns in one, so a poor order is left for a better one.
+the settlement's own rules for lateness, less the value of the time and the ways it takes. A new order is worth taking
+if the round with its two stops inserted at their best places is worth more than the round without. The value of a
+second is what a good courier earns in one, so a poor order is left for a better one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 Point = tuple[float, float]
 Metres = Callable[[Point, Point], float]
+Progress = tuple[Point, float, float, float, float, int]
+"""Place, seconds from now, metres, idle seconds, income and actions so far."""
 
 PICKUP, DROPOFF = "pickup", "dropoff"
 GRACE_S = 60.0
@@ -71,6 +74,9 @@ class Planner:
         stop: seconds lost at each stop.
         delay: seconds until the round can begin.
         horizon: seconds until the shift ends; what is delivered later pays nothing.
+        actions: actions that may still be taken; what is delivered after them pays nothing.
+        per_pickup: actions of a pick-up (2 with packing the bag).
+        per_offer: actions to accept one more offer (0 when one action accepts any number).
     """
 
     metres: Metres
@@ -82,12 +88,42 @@ class Planner:
     stop: float = 4.0
     delay: float = 0.0
     horizon: float = float("inf")
+    actions: float = float("inf")
+    per_pickup: int = 2
+    per_offer: int = 0
     jobs: dict[int, Job] = field(default_factory=dict)
 
-    def worth(self, start: Point, stops: Sequence[Stop]) -> Worth:
-        """The worth of driving `stops` in order, starting now at `start`."""
-        now, way, income, idle, actions = self.delay, 0.0, 0.0, 0.0, len(stops)
-        here = start
+    def worth(self, start: Point, stops: Sequence[Stop], spent: int = 0) -> Worth:
+        """The worth of driving `stops` in order, starting now at `start`, after `spent` other actions."""
+        return self._value(self._drive(self._begin(start, spent), stops))
+
+    def insert(self, start: Point, stops: Sequence[Stop], job: Job, spent: int = 0) -> tuple[Worth, list[Stop]]:
+        """The best round with the stops of `job` added, the others keeping their sequence."""
+        self.jobs[job.id] = job
+        drop = Stop(job.id, DROPOFF, job.dropoff)
+        pick = [] if job.picked else [Stop(job.id, PICKUP, job.pickup)]
+        before = self._begin(start, spent)
+        best, at = Worth(-math.inf, 0.0, 0.0, 0.0), (0, 0)
+        for i in range(len(stops) + 1):
+            # Candidates with the pick-up at i share the way up to it, and each next one the way up to its drop-off.
+            now = self._drive(before, pick)
+            for j in range(i, len(stops) + 1):
+                worth = self._value(self._drive(now, (drop, *stops[j:])))
+                if worth.value > best.value:
+                    best, at = worth, (i, j)
+                if not pick or j == len(stops):
+                    break
+                now = self._drive(now, stops[j : j + 1])
+            before = self._drive(before, stops[i : i + 1])
+        i, j = at
+        return best, [*stops[:i], *pick, *stops[i:j], drop, *stops[j:]]
+
+    def _begin(self, start: Point, spent: int) -> Progress:
+        return (start, self.delay, 0.0, 0.0, 0.0, spent)
+
+    def _drive(self, progress: Progress, stops: Sequence[Stop]) -> Progress:
+        """Where the courier is after `stops`, with the totals so far."""
+        here, now, way, idle, income, actions = progress
         for stop in stops:
             if stop.place != here:
                 leg = self.metres(here, stop.place)
@@ -97,31 +133,20 @@ class Planner:
                 here = stop.place
             job = self.jobs[stop.job]
             if stop.kind == PICKUP:
+                actions += self.per_pickup
                 if job.ready > now:
                     idle += job.ready - now
                     now = job.ready
-            elif now <= self.horizon:
+                continue
+            actions += 1
+            if now <= self.horizon and actions <= self.actions:
                 income += payment(job.pay, job.elapsed + now, job.limit)
+        return here, now, way, idle, income, actions
+
+    def _value(self, progress: Progress) -> Worth:
+        _, now, way, idle, income, actions = progress
         time = self.second * (now - idle) + self.idle * idle
         return Worth(income - time - self.metre * way - self.call * actions, now, way, income)
-
-    def insert(self, start: Point, stops: Sequence[Stop], job: Job) -> tuple[Worth, list[Stop]]:
-        """The best round with the stops of `job` added, the others keeping their sequence."""
-        self.jobs[job.id] = job
-        drop = Stop(job.id, DROPOFF, job.dropoff)
-        pick = None if job.picked else Stop(job.id, PICKUP, job.pickup)
-        best: tuple[Worth, list[Stop]] | None = None
-        for i in range(len(stops) + 1):
-            head = [*stops[:i]] if pick is None else [*stops[:i], pick]
-            for j in range(i, len(stops) + 1):
-                candidate = [*head, *stops[i:j], drop, *stops[j:]]
-                worth = self.worth(start, candidate)
-                if best is None or worth.value > best[0].value:
-                    best = (worth, candidate)
-                if pick is None:
-                    break
-        assert best is not None
-        return best
 
     def improve(self, start: Point, stops: Sequence[Stop], rounds: int = 2) -> tuple[Worth, list[Stop]]:
         """Take each order out and put it back at its best place until nothing gains, at most `rounds` times."""
@@ -156,22 +181,23 @@ class Planner:
     ) -> tuple[list[int], list[Stop]]:
         """Take the offers that raise the worth of the round by `margin` each or more, at most `room` of them.
 
-        Orders make each other worthwhile: two on one way may pay where neither does alone. So up to `PATIENCE` offers are
-        added on trial before the search gives up.
+        Orders make each other worthwhile: two on one way may pay where neither does alone. So up to `PATIENCE` offers
+        are added on trial before the search gives up.
 
         Returns:
             ids to accept, in order of choice, and the round that serves them.
         """
-        current, accepted, left = list(stops), [], list(offers)
+        current, left = list(stops), list(offers)
+        accepted: list[int] = []
         best = self.worth(start, current).value
         kept, plan = 0, current
         while left and len(accepted) < room and len(accepted) < kept + PATIENCE:
-            trials = [(self.insert(start, current, job), job) for job in left]
+            spent = 1 + self.per_offer * len(accepted)
+            trials = [(self.insert(start, current, job, spent), job) for job in left]
             (worth, current), job = max(trials, key=lambda trial: (trial[0][0].value, -trial[1].id))
             accepted.append(job.id)
             left.remove(job)
-            asking = margin * (len(accepted) - kept) + (self.call if not kept else 0.0)
-            if worth.value >= best + asking:
+            if worth.value >= best + margin * (len(accepted) - kept):
                 best, kept, plan = worth.value, len(accepted), current
         return accepted[:kept], plan
 

@@ -79,8 +79,9 @@ class Recorder:
 def evaluate(state: State, recorder: Recorder, shift_hours: float, initial_balance: float) -> dict[str, float | None]:
     """The evaluator's figures (None where the denominator is zero).
 
-    Rates are shares in [0, 1], ``*_per_hour`` are per hour of the shift, ``stamina_per_hour`` and
-    ``interruptions_per_hour`` per active hour; ``time_utilisation`` can exceed 1 because orders overlap.
+    Rates are shares in [0, 1], ``*_per_hour`` are per hour of the shift, but ``stamina_per_hour`` and
+    ``interruptions_per_hour`` per active hour. Expenses leave bus fares out, as the benchmark does.
+    ``time_utilisation`` can exceed 1 because orders overlap.
     """
     done = state.settlements
     active = state.tick / TICKS
@@ -146,6 +147,8 @@ def report(state: State, recorder: Recorder, shift_hours: float, initial_balance
         },
         "orders": _orders(state),
         "activity": {
+            "active_time_ratio": _ratio(sum(s.duration for s in done), active),
+            "orders_per_hour": _ratio(len(done), active / 3600.0),
             "idle_seconds": dict(recorder.idle),
             "mode_seconds": {mode: ticks / TICKS for mode, ticks in recorder.mode_ticks.items() if ticks},
         },

@@ -115,13 +115,9 @@ def _order(world: World, order: OrderState, cards: OfferCards, field: DistanceFi
     offer, rules = order.offer, world.rules
     elapsed = (world.state.tick - order.accepted) / rules.ticks_per_second
     ready_in = max(0.0, offer.prep - elapsed)
-    if order.picked is None:
-        status = PREPARING if ready_in > 0.0 else READY
-    else:
-        status = IN_HAND if order.pending else IN_BAG
     return {
         **cards[offer.id],
-        "status": status,
+        "status": _status(order, ready_in),
         "elapsed_s": round(elapsed, 1),
         "time_left_s": round(offer.limit - elapsed, 1),
         "ready_in_s": round(ready_in, 1) if order.picked is None else 0.0,
@@ -130,6 +126,12 @@ def _order(world: World, order: OrderState, cards: OfferCards, field: DistanceFi
         "handoff_xy": None if rules.handoff_hidden or offer.handoff is None else metres(offer.handoff),
         "hand": [item.name for item in order.pending],
     }
+
+
+def _status(order: OrderState, ready_in: float) -> str:
+    if order.picked is not None:
+        return IN_HAND if order.pending else IN_BAG
+    return PREPARING if ready_in > 0.0 else READY
 
 
 def _car(state: State) -> dict[str, Any] | None:

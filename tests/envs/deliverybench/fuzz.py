@@ -10,16 +10,20 @@ from agentspec.envs.deliverybench.world import HANDLERS
 
 HOSTILE = [
     "", " ", "()", "NAN", "nan", "inf", "-inf", "1e308", "1e999", "-1e999", "1e999m", "9" * 400, "0x10", "1_0", "0",
-    "-1", "1.5", "None", "True", "[]", "[[]]", "{}", "()", "(1,)", '""', "''", '"\\x00"', "\x00", "\ud800", "“1”", "１２",
-    "lambda: 0", "__import__('os')", "1+1", "*[1]", "**{}", "f(1)", "x=", "=", ",", ",,", "1m", "1 m", "1mm", "m", "1e3m",
+    "-1", "1.5", "None", "True", "[]", "[[]]", "{}", "()", "(1,)", '""', "''", '"\\x00"', "\x00", "\ud800", "“1”",
+    "１２",
+    "lambda: 0", "__import__('os')", "1+1", "*[1]", "**{}", "f(1)", "x=", "=", ",", ",,", "1m", "1 m", "1mm", "m",
+    "1e3m",
     "[1e999]", "[None]", "[{}]", '{"item_id": []}', '[{"item_id": "ice_pack", "qty": 1e999}]', "{[]: 1}", "{1: 2}",
     '"A"', '"walk"', '"charge_done"', "b'x'", "1j", "...", "(" * 60 + ")" * 60, "[" * 90 + "]" * 90, "-" * 80 + "1",
     '"order 1: 1 -> A; 1 -> B"', '"A.1 -> B"', '"order 99999999999999999999: 1 -> A"', '"1.5 -> A"', '"1 -> "', '"->"',
-    '"order 0: 1 & 2 -> A"', '"A.99999999999999999999999 -> B"', '"order ²: ² -> A"', '"order 0: ٣ -> A"', "'" * 3, "#", "\\",
+    '"order 0: 1 & 2 -> A"', '"A.99999999999999999999999 -> B"', '"order ²: ² -> A"', '"order 0: ٣ -> A"', "'" * 3,
+    "#", "\\",
 ]  # fmt: skip
 KEYS = [
     "x", "y", "pace", "ids", "order_id", "id", "orders", "oid", "method", "to", "target_pct", "seconds", "until", "qty",
-    "item", "item_id", "items", "name", "bag_cmd", "cmd", "comp", "bus_id", "target_stop_id", "angle", "direction", "text",
+    "item", "item_id", "items", "name", "bag_cmd", "cmd", "comp", "bus_id", "target_stop_id", "angle", "direction",
+    "text",
     "kind", "self", "class",
 ]  # fmt: skip
 WRAPS = [

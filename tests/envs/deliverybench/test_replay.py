@@ -39,6 +39,10 @@ def test_reference_report(path: Path) -> None:
     assert figures["effective_time_ratio"] == pytest.approx(activity["effective_time_ratio"], abs=1e-5)
     assert figures["prevention_rate"] in (None, pytest.approx(want["prevention"]["prevention_rate"], abs=1e-5))
     assert (figures["on_time_rate"] or 0.0) == pytest.approx(want["orders"]["ontime_rate"] or 0.0, abs=1e-5)
+    assert json.loads(json.dumps(got)) == got
+    bucket = want["capability_buckets"]["high_level_planning"]
+    assert got["activity"]["active_time_ratio"] == pytest.approx(bucket["active_time_ratio"], abs=1e-5)
+    assert got["activity"]["orders_per_hour"] == pytest.approx(activity["orders_per_hour"], abs=1e-5)
     assert got["money"]["base_wage"] == pytest.approx(money["base_wage"], abs=1e-4)
     assert got["money"]["expenses"]["charging"] == pytest.approx(money["expense_breakdown"]["charging"], abs=1e-4)
     consumed = got["energy"]["personal_consumed_pct"], got["energy"]["battery_consumed_pct"]
@@ -50,7 +54,9 @@ def test_reference_report(path: Path) -> None:
     assert got["interruptions"] == interruptions
     assert got["calls"]["parse_failures"] == want["vlm"]["parse_failures"]
     own = {"MOVE": "move_to", "CHARGE": "charge_escooter", "SWITCH": "switch_transport"}
-    attempts = {own.get(name, name.lower()): (row["attempts"], row["successes"]) for name, row in got["actions"].items()}
+    attempts = {
+        own.get(name, name.lower()): (row["attempts"], row["successes"]) for name, row in got["actions"].items()
+    }
     assert attempts == {name: (row["attempts"], row["successes"]) for name, row in want["actions"].items()}
 
 

@@ -57,7 +57,8 @@ def test_perfect_order() -> None:
 
 
 def test_wrong_method_and_cold_food() -> None:
-    # Burger 16 degrees off: 0.5*1 + 0.2*5 + 0.3*5 = 3.0 -> 3. Wrong method: 1. (7.5 + 3 + 0.5) / 3 = 3.67 -> 4: bonus 1.5.
+    # Burger 16 degrees off: 0.5*1 + 0.2*5 + 0.3*5 = 3.0 -> 3 stars. Wrong method: 1.
+    # (1.5*5 + 3 + 0.5*1) / 3 = 3.67 -> 4 stars: bonus 1.5.
     result = graded(item("Burger", offset=-16.0), method="call", methods=("knock",))
     assert (result.food_star, result.method_star, result.stars, result.bonus) == (3, 1, 4, 1.5)
     assert not result.temp_ok

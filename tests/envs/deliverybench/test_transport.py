@@ -14,8 +14,10 @@ from tests.envs.deliverybench.helpers import do, metres, off, refuse, stand, tin
 Point = tuple[float, float]
 
 
-def tick_by_tick(start: Point, waypoints: list[Point], step: float, target: Point, limit: int) -> tuple[int, bool, Point]:
-    """The definition: each tick, pass waypoints within 5 m, then one step towards the next; done within 5 m of target."""
+def tick_by_tick(
+    start: Point, waypoints: list[Point], step: float, target: Point, limit: int
+) -> tuple[int, bool, Point]:
+    """The definition: each tick, pass waypoints within 5 m and step to the next; done within 5 m of the target."""
     (x, y), i, last = start, 0, len(waypoints) - 1
     for tick in range(1, limit + 1):
         while i < last and math.dist((x, y), waypoints[i]) <= 500.0:
@@ -63,7 +65,8 @@ coordinate = st.integers(-60_000, 60_000).map(lambda n: n / 4)
 @settings(max_examples=200, deadline=None)
 @given(
     st.lists(st.tuples(coordinate, coordinate), min_size=2, max_size=6),
-    st.sampled_from([11.25, 15.0, 20.0, 45.0, 60.0, 75.0, 120.0, 150.0]),
+    # Odd steps: with round ones both ways of counting may meet the 5 m exactly, and rounding decides.
+    st.sampled_from([11.2537, 15.0041, 20.0062, 45.0113, 60.0171, 75.0209, 120.0283, 149.9761]),
     st.integers(1, 6000),
 )
 def test_closed_form_equals_ticks(points: list[Point], step: float, limit: int) -> None:

@@ -1,0 +1,373 @@
+"""DeliveryBench as a Gymnasium environment: text in, text out, dollars as reward.
+
+An observation is the dynamic text (and optionally the map as an image); everything static stands in
+`info["instruction"]`, everything structured in `info["state"]`. The reward of a step is the change of the balance, so
+the return of an episode is the net earnings. The end of the shift is the task's natural end (`terminated`); running out
+of steps or of allowed actions is not (`truncated`).
+
+In menu mode (`action_mode="menu"`) the action is one of `info["action_schema"].choices`; a native call is accepted too.
+`snapshot` and `restore` are exact, so that a search can try actions and groups of rollouts can start alike.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import string
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from agentspec.actions import parse_action
+from agentspec.envs.deliverybench.citymap import City, load_city
+from agentspec.envs.deliverybench.events import Progress, events_since
+from agentspec.envs.deliverybench.generate import generate
+from agentspec.envs.deliverybench.menu import Option, options
+from agentspec.envs.deliverybench.observation import compact_text, full_text, instruction, surroundings
+from agentspec.envs.deliverybench.rules import Rules, rules_named
+from agentspec.envs.deliverybench.view import OfferCards, describe
+from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.types import ActionError, ActionSchema
+
+CHARSET = string.printable
+MAX_TEXT = 100_000
+MAX_ACTION = 512
+SNAPSHOT_VERSION = 1
+
+Point = tuple[float, float]
+Observation = dict[str, Any]
+
+
+def city_of(map: str | Path | None = None, size: str = "small", city_seed: int = 0) -> City:
+    """The city an environment with these arguments runs in: the folder `map` if given, else a generated city."""
+    return load_city(map) if map is not None else generate(size, city_seed)
+
+
+class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
+    """One courier, one shift.
+
+    Args:
+        map: folder of a city in the benchmark's format; None takes a generated city.
+        size, city_seed: of the generated city ("tiny", "small", "medium", "large"; see `generate`).
+        rules: "fair", "original" or a `Rules` object.
+        shift_hours: length of the shift in simulated hours.
+        observation: "full" or "compact" text.
+        action_mode: "native" calls, or one of a "menu" of choices.
+        max_steps: steps after which the episode is truncated; None leaves the rules' limit of actions.
+        order_seed: "seed" (orders follow the reset seed), "original" (the one sequence of the original runner, whatever
+            the seed), or a number.
+        start_battery: battery of the scooter at the start (%), None as the rules say.
+        render_mode: None or "rgb_array".
+        images: put the map picture into the observation as "image", uint8 (480, 720, 3).
+
+    Raises:
+        ValueError: an argument that is none of these.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        map: str | Path | None = None,
+        size: str = "small",
+        city_seed: int = 0,
+        rules: str | Rules = "fair",
+        shift_hours: float = 1.0,
+        observation: Literal["full", "compact"] = "full",
+        action_mode: Literal["native", "menu"] = "native",
+        max_steps: int | None = None,
+        order_seed: int | str | None = "seed",
+        start_battery: float | None = None,
+        render_mode: str | None = None,
+        images: bool = False,
+    ) -> None:
+        _check("observation", observation, ("full", "compact"))
+        _check("action_mode", action_mode, ("native", "menu"))
+        _check("render_mode", render_mode, (None, "rgb_array"))
+        if isinstance(order_seed, str):
+            _check("order_seed", order_seed, ("seed", "original"))
+        if max_steps is not None and max_steps < 1:
+            raise ValueError(f"max_steps is {max_steps}; expected at least 1, or None")
+        self.city = city_of(map, size, city_seed)
+        self.rules = _adapted(rules_named(rules), max_steps, start_battery)
+        self.shift_hours = shift_hours
+        self.compact = observation == "compact"
+        self.menu_mode = action_mode == "menu"
+        self.max_steps = max_steps
+        self.order_seed = order_seed
+        self.render_mode = render_mode
+        self.images = images
+        self.instruction = instruction(self.city, self.rules, shift_hours, self.compact, self.menu_mode)
+        self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0, charset=CHARSET)
+        text = spaces.Text(max_length=MAX_TEXT, min_length=1, charset=CHARSET)
+        shown: dict[str, spaces.Space[Any]] = {"text": text}
+        if images:
+            from agentspec.envs.deliverybench.render import HEIGHT, WIDTH
+
+            shown["image"] = spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+        self.observation_space = spaces.Dict(shown)
+        self._world: World | None = None
+
+    # -- the Gymnasium interface -------------------------------------------------------------------------------
+
+    @property
+    def world(self) -> World:
+        """The running world.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._world is None:
+            raise gymnasium.error.ResetNeeded("call reset() before anything else")
+        return self._world
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a shift; the same seed starts the same one. Without a seed the next one of the stream is drawn."""
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(0, 2**31))
+        orders = seed if self.order_seed == "seed" else None if self.order_seed == "original" else self.order_seed
+        assert orders is None or isinstance(orders, int)
+        self._world = World(self.city, self.rules, orders, self.shift_hours)
+        self._cards = OfferCards(self._world.book)
+        self._steps = 0
+        self._last = _Last()
+        self._track: list[list[float | str]] = [[self._world.state.mode, *self._world.state.position]]
+        return self.observe()
+
+    def step(self, action: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Carry out one action given as text; no text raises. After the end nothing happens any more."""
+        world = self.world
+        text = str(action)
+        call, problem = self._native(text)
+        before = Progress.of(world)
+        balance = world.state.balance
+        mode = world.state.mode
+        outcome = world.step(call)
+        self._steps += 1
+        self._last = _Last.of(outcome, call, problem, events_since(before, world, outcome))
+        if world.state.position != tuple(self._track[-1][1:]):
+            self._track.append([mode, *world.state.position])
+        observation, info = self.observe()
+        return observation, world.state.balance - balance, self._terminated, self._truncated, info
+
+    def observe(self) -> tuple[Observation, dict[str, Any]]:
+        """The current observation and info, without stepping (after `restore`, say)."""
+        world, last = self.world, self._last
+        view = describe(world, self._cards)
+        if self.max_steps is not None:
+            view["calls_left"] = max(0, self.max_steps - self._steps)
+        self._menu = self._options(view)
+        choices = tuple(self._menu)
+        schema = replace(world.schema, choices=choices) if choices else world.schema
+        if self.compact:
+            text = compact_text(view, last.error or last.message, choices)
+        else:
+            text = full_text(view, surroundings(self.city, view))
+            if choices:
+                text += "\n\nChoices: " + "; ".join(choices)
+        observation: Observation = {"text": _printable(text)}
+        if self.images:
+            observation["image"] = self._picture()
+        return observation, self._info(view, schema)
+
+    def render(self) -> npt.NDArray[np.uint8] | None:
+        """The map as uint8 (H, W, 3) with `render_mode="rgb_array"`, else None."""
+        return self._picture() if self.render_mode == "rgb_array" else None
+
+    # -- exact state -------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> bytes:
+        """The exact state as bytes, for `restore` into an environment with the same arguments and reset seed."""
+        world = self.world
+        state = {
+            "version": SNAPSHOT_VERSION,
+            "seed": world.seed,
+            "world": world.snapshot().decode("utf-8"),
+            "steps": self._steps,
+            "last": self._last.dump(),
+            "track": self._track,
+        }
+        return json.dumps(state, separators=(",", ":")).encode("utf-8")
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`.
+
+        Raises:
+            ValueError: the bytes are no snapshot of this kind of environment.
+        """
+        try:
+            state = json.loads(blob)
+            version, seed = state["version"], state["seed"]
+            blob, steps, last, track = state["world"].encode("utf-8"), state["steps"], state["last"], state["track"]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"these bytes are no snapshot of a DeliveryBench environment ({error!r})") from error
+        if version != SNAPSHOT_VERSION:
+            raise ValueError(f"got a snapshot of version {version}; this release reads version {SNAPSHOT_VERSION}")
+        if self._world is None or self._world.seed != seed:
+            self._world = World(self.city, self.rules, seed, self.shift_hours)
+            self._cards = OfferCards(self._world.book)
+        self._world.restore(blob)
+        self._steps, self._last, self._track = steps, _Last(**last), track
+        self._menu = self._options(describe(self._world, self._cards))
+
+    # -- internals ---------------------------------------------------------------------------------------------
+
+    @property
+    def _terminated(self) -> bool:
+        return self.world.state.reason == "shift"
+
+    @property
+    def _truncated(self) -> bool:
+        state = self.world.state
+        out_of_steps = self.max_steps is not None and self._steps >= self.max_steps
+        return not self._terminated and (state.ended or out_of_steps)
+
+    def _options(self, view: Mapping[str, Any]) -> dict[str, Option]:
+        return {option.text: option for option in options(view)} if self.menu_mode else {}
+
+    def _native(self, text: str) -> tuple[str, str]:
+        """The native call for an answer, and in menu mode the problem with an answer that is neither."""
+        if not self.menu_mode:
+            return text, ""
+        schema = ActionSchema(
+            self.world.schema.actions, self.world.schema.aliases, self.world.schema.units, tuple(self._menu)
+        )
+        action = parse_action(text, schema)
+        if isinstance(action, ActionError):
+            return text, action.message
+        chosen: Option | None = self._menu.get(action.name)
+        return (text, "") if chosen is None else (chosen.call, "")
+
+    def _info(self, view: dict[str, Any], schema: ActionSchema) -> dict[str, Any]:
+        world, last = self.world, self._last
+        earned = world.state.balance - self.rules.initial_balance
+        metrics: dict[str, Any] = {
+            "net_earnings": earned,
+            "deliveries": len(world.state.settlements),
+            "clock_s": view["clock_s"],
+        }
+        info: dict[str, Any] = {
+            "instruction": self.instruction,
+            "action_schema": schema,
+            "state": view,
+            "balance": world.state.balance,
+            "net_earnings": earned,
+            "error": last.error,
+            "error_code": last.code,
+            "message": last.message,
+            "invalid": last.invalid,
+            "events": list(last.events),
+            "seconds": last.seconds,
+            "native_action": last.call,
+            "metrics": metrics,
+            "state_hash": state_hash(view),
+        }
+        if self._terminated or self._truncated:
+            report = world.summary()
+            metrics.update(report["evaluation"])
+            info["report"] = report
+        return info
+
+    def _picture(self) -> npt.NDArray[np.uint8]:
+        from agentspec.envs.deliverybench.render import render
+
+        return render(self.world, [(str(mode), (float(x), float(y))) for mode, x, y in self._track])
+
+
+class _Last:
+    """What the last step left for the next observation."""
+
+    __slots__ = ("call", "code", "error", "events", "invalid", "message", "seconds")
+
+    def __init__(
+        self,
+        call: str = "",
+        code: str = "",
+        error: str = "",
+        message: str = "",
+        invalid: bool = False,
+        seconds: float = 0.0,
+        events: list[str] | None = None,
+    ) -> None:
+        self.call = call
+        self.code = code
+        self.error = error
+        self.message = message
+        self.invalid = invalid
+        self.seconds = seconds
+        self.events = events or []
+
+    @classmethod
+    def of(cls, outcome: Outcome, call: str, problem: str, events: list[str]) -> _Last:
+        """From a step's outcome; `problem` replaces the message of an answer that is no choice of the menu."""
+        message = problem or outcome.message
+        for settled in outcome.settlements:
+            message += f": {settled.stars} stars, ${settled.paid:.2f}"
+        failed = outcome.ok is False
+        return cls(
+            call=call[:MAX_ACTION],
+            code=outcome.code,
+            error=message if failed else "",
+            message=f"failed: {message}" if failed else message,
+            invalid=failed,
+            seconds=outcome.seconds,
+            events=events,
+        )
+
+    def dump(self) -> dict[str, Any]:
+        """The constructor's arguments as JSON values."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def state_hash(view: Mapping[str, Any]) -> str:
+    """A short hash of what matters for the next decision, equal for states that differ only in small change: place to
+    5 m, battery and energy to 10 %, clock to the minute, and the orders with their status."""
+    x, y = view["position"]
+    facts = (
+        round(x / 5.0),
+        round(y / 5.0),
+        view["mode"],
+        int(view["battery"] // 10),
+        int(view["energy"] // 10),
+        int(view["clock_s"] // 60),
+        view["charging"] is not None,
+        tuple((order["id"], order["status"]) for order in view["orders"]),
+        tuple(offer["id"] for offer in view["offers"]),
+        tuple(sorted(view["inventory"].items())),
+    )
+    return hashlib.blake2b(repr(facts).encode("utf-8"), digest_size=8).hexdigest()
+
+
+def _adapted(rules: Rules, max_steps: int | None, start_battery: float | None) -> Rules:
+    if max_steps is not None:
+        rules = replace(rules, max_calls=None)
+    if start_battery is None:
+        return rules
+    if not 0.0 <= start_battery <= 100.0:
+        raise ValueError(f"start_battery is {start_battery}; expected percent, 0 to 100")
+    return replace(rules, initial_battery=float(start_battery))
+
+
+def _check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
+
+
+_PRINTABLE = frozenset(CHARSET)
+
+
+def _printable(text: str) -> str:
+    # Messages quote what the agent wrote; the text space holds printable ASCII only.
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(c if c in _PRINTABLE else "?" for c in text)[:MAX_TEXT]

@@ -1,0 +1,169 @@
+"""The budget of one decision: calls and tokens, and what happens when they run out.
+
+A method with many calls per decision asks the model through a :class:`Meter`. Questions that do not depend on each
+other are asked together (:meth:`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
+end a search early: the method's own limits, the episode's budget, and a prompt that outgrew the model's context. All
+three raise :class:`OutOfBudgetError`; the method catches it and answers with the best action it has, flagged by
+``trace["exhausted"]``. Only if it has none is there nothing to answer with: see :meth:`Meter.undecided`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from agentspec.llm.base import ContextOverflowError, LLMError, Message
+from agentspec.llm.recorder import BudgetExceededError, ModuleLLM
+from agentspec.types import ActionError, Credit, Decision, LLMCall
+
+
+class OutOfBudgetError(BudgetExceededError):
+    """The search may not go on: its own limits, the episode's budget or the model's context are used up."""
+
+
+@dataclass(frozen=True)
+class Ask:
+    """One question: what for, the prompt, sampling overrides, and the credit of its completions."""
+
+    purpose: str
+    messages: Sequence[Message]
+    sampling: Mapping[str, Any] = field(default_factory=dict)
+    credit: Credit = "aux"
+
+
+class Meter:
+    """A module's model under the budget of one decision.
+
+    Args:
+        llm: the module's metered model.
+        calls: most requests and scorings (``None``: no limit).
+        tokens: once this many tokens went in and out, no further request is made (``None``: no limit).
+
+    Attributes:
+        exhausted: what ran out: ``"calls"``, ``"tokens"``, ``"episode"`` (its budget), ``"context"``, or empty.
+    """
+
+    def __init__(self, llm: ModuleLLM, calls: int | None = None, tokens: int | None = None) -> None:
+        self._llm = llm
+        self._limits = {"calls": calls, "tokens": tokens}
+        self.calls = 0
+        self.scorings = 0
+        self.tokens = 0
+        self.exhausted = ""
+        self._error: LLMError | None = None
+
+    @property
+    def constrains(self) -> bool:
+        """Whether the backend decodes under a constraint."""
+        return "choices" in self._llm.recorder.llm.capabilities
+
+    async def ask(self, purpose: str, messages: Sequence[Message], credit: Credit = "aux", **sampling: Any) -> LLMCall:
+        """One request.
+
+        Raises:
+            OutOfBudgetError: it may not be made.
+        """
+        calls = await self.ask_all([Ask(purpose, messages, sampling, credit)])
+        self.stop()
+        return calls[0]
+
+    async def ask_all(self, asks: Sequence[Ask]) -> list[LLMCall]:
+        """Independent requests, made together; answers in their order.
+
+        Fewer answers than requests come back when the budget ends among them: the first ones. Use those, then call
+        :meth:`stop`.
+        """
+        asks = asks[: self._allowed(len(asks))]
+        self.calls += len(asks)
+        answers = await asyncio.gather(*(self._ask(a) for a in asks), return_exceptions=True)
+        calls: list[LLMCall] = []
+        for answer in answers:
+            if isinstance(answer, LLMCall):
+                calls.append(answer)
+            elif isinstance(answer, BudgetExceededError | ContextOverflowError):
+                if not self.exhausted:
+                    self.exhausted = "episode" if isinstance(answer, BudgetExceededError) else "context"
+                    self._error = answer
+            else:
+                raise answer
+        # With one prompt too long among others, those after it would be taken for its answers.
+        return calls if len(calls) == len(asks) else calls[: _first_failure(answers)]
+
+    async def _ask(self, ask: Ask) -> LLMCall:
+        call = await self._llm.generate(ask.purpose, ask.messages, **ask.sampling)
+        self.tokens += call.usage.input_tokens + call.usage.output_tokens
+        if ask.credit != "aux":
+            for i in range(len(call.completions)):
+                self._llm.recorder.credit(call.id, i, ask.credit)
+        return call
+
+    async def score_all(self, asks: Sequence[tuple[Sequence[Message], Sequence[str]]]) -> list[tuple[float, ...]]:
+        """Log-probabilities of continuations after their prompts; one scoring each.
+
+        Raises:
+            OutOfBudgetError: not all of them may be made.
+        """
+        if self._allowed(len(asks)) < len(asks):
+            self.stop()
+        self.scorings += len(asks)
+        for messages, continuations in asks:
+            self.tokens += sum(self._llm.count_tokens(text) for text in (*(m.text for m in messages), *continuations))
+        try:
+            return list(await asyncio.gather(*(self._llm.score(m, c) for m, c in asks)))
+        except ContextOverflowError as error:
+            self.exhausted, self._error = "context", error
+            raise OutOfBudgetError(str(error)) from error
+
+    def _allowed(self, wanted: int) -> int:
+        """How many of ``wanted`` requests the limits leave room for."""
+        if self.exhausted:
+            return 0
+        if self._limits["tokens"] is not None and self.tokens >= self._limits["tokens"]:
+            self.exhausted = "tokens"
+            return 0
+        room = wanted if self._limits["calls"] is None else self._limits["calls"] - self.calls - self.scorings
+        if room < wanted:
+            self.exhausted = "calls"
+        return max(0, min(wanted, room))
+
+    def stop(self) -> None:
+        """Raise :class:`OutOfBudgetError` if something ran out."""
+        if self.exhausted:
+            limit = self._limits.get(self.exhausted)
+            raise OutOfBudgetError(
+                str(self._error) if self._error else f"the search's limit of {limit} {self.exhausted} is reached"
+            )
+
+    def trace(self) -> dict[str, Any]:
+        """What a decision's trace says about its cost, and what ran out if something did."""
+        spent: dict[str, Any] = {"calls": self.calls, "tokens": self.tokens}
+        if self.scorings:
+            spent["scorings"] = self.scorings
+        if self.exhausted:
+            spent["exhausted"] = self.exhausted
+        return spent
+
+    def undecided(self, answered: str, trace: Mapping[str, Any]) -> Decision:
+        """The flagged fallback when no legal action was found: an error that the environment answers.
+
+        Args:
+            answered: what the model wrote instead.
+            trace: the method's trace.
+
+        Raises:
+            LLMError: the episode's budget or the model's context is what ran out; the episode ends in an orderly way.
+        """
+        if self._error is not None:
+            raise self._error
+        message = f"no legal action was found among the answers (the first reads {answered[:60]!r})"
+        return Decision(
+            ActionError("NO_ACTION", message, answered[:200]),
+            valid=False,
+            trace={**trace, **self.trace(), "fallback": "nothing parsed"},
+        )
+
+
+def _first_failure(answers: Sequence[object]) -> int:
+    return next(i for i, answer in enumerate(answers) if not isinstance(answer, LLMCall))

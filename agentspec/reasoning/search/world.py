@@ -1,0 +1,127 @@
+"""The two worlds a search can move in: the environment itself, and the model's idea of it.
+
+Both take a node's parent state and action to an :class:`Outcome`. The environment is exact and is put back by its
+user; the model predicts in words what would be observed, and whether the goal would be reached.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from agentspec.llm.base import Message
+from agentspec.protocols import Services, Simulator
+from agentspec.reasoning.common import clip, with_request
+from agentspec.reasoning.search.meter import Meter
+from agentspec.reasoning.search.tree import Node
+from agentspec.types import ActionSchema, AgentInput
+
+PREDICT = (
+    "Nobody acts now; imagine. What would be observed after the last step above? Write the new situation in at most "
+    "three short sentences: only what changes, and the numbers that matter. Then write a last line 'Goal: yes' if the "
+    "task would be accomplished by then, otherwise 'Goal: no'."
+)
+STEPS = "Steps tried in thought from here:\n{steps}"
+
+_GOAL = re.compile(r"\bgoal\W{0,4}(yes|no)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an action leads to.
+
+    Args:
+        state: what the world needs to go on from here (environment: a snapshot; model: nothing).
+        text: what is observed.
+        schema: actions there; in an imagined state the last known ones.
+        reward: reward of the step (model: 1 if the goal is reached, else 0).
+        ended: nothing follows.
+        success: whether an ended state is a success; ``None`` if the world does not say.
+    """
+
+    state: Any
+    text: str
+    schema: ActionSchema
+    reward: float = 0.0
+    ended: bool = False
+    success: bool | None = None
+
+
+class World(Protocol):
+    """Where a search tries its steps. ``real``: in the environment itself."""
+
+    real: bool
+
+    async def step(self, node: Node) -> Outcome:
+        """What ``node``'s action leads to; the parent's ``state`` is an outcome (or the root's)."""
+        ...
+
+
+class RealWorld:
+    """The episode's environment, through its simulator."""
+
+    real = True
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+
+    async def step(self, node: Node) -> Outcome:
+        assert node.parent is not None
+        await self._simulator.restore(node.parent.state.state)
+        seen = await self._simulator.step(node.action)
+        blob = b"" if seen.ended else await self._simulator.snapshot()
+        success = seen.info.get("success")
+        return Outcome(
+            blob,
+            seen.input.text,
+            seen.input.action_schema,
+            seen.reward,
+            seen.ended,
+            None if success is None else bool(success),
+        )
+
+
+class ModelWorld:
+    """The model predicts observations.
+
+    Args:
+        base: prompt that ends with the current observation.
+        tokens: most tokens of a prediction, and of the steps shown before it.
+        sampling: further sampling overrides.
+    """
+
+    real = False
+
+    def __init__(
+        self, meter: Meter, services: Services, base: Sequence[Message], *, tokens: int, path_tokens: int, **sampling: Any
+    ) -> None:
+        self._meter = meter
+        self._services = services
+        self._base = base
+        self._sampling = {"max_tokens": tokens, **sampling}
+        self._path_tokens = path_tokens
+
+    async def step(self, node: Node) -> Outcome:
+        assert node.parent is not None
+        request = f"{render_steps(node, self._services, self._path_tokens)}\n\n{PREDICT}"
+        call = await self._meter.ask("world", with_request(self._base, request), **self._sampling)
+        verdicts = _GOAL.findall(call.text)
+        reached = bool(verdicts) and verdicts[-1].casefold() == "yes"
+        text = _GOAL.sub("", call.text).strip() or "nothing that could be foreseen"
+        return Outcome(None, text, node.parent.state.schema, float(reached), reached, True if reached else None)
+
+
+def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:
+    """The state that a search starts from."""
+    return Outcome(blob, input.text, input.action_schema)
+
+
+def render_steps(node: Node, services: Services, budget: int) -> str:
+    """The steps from the root to ``node`` with what was observed after each, the newest within ``budget`` tokens."""
+    lines = []
+    for i, step in enumerate(node.path[1:], 1):
+        seen = f" -> {step.state.text}" if step.state is not None else ""
+        lines.append(f"{i}. {step.action}{seen}")
+    return STEPS.format(steps=clip("\n".join(lines), budget, services, keep="tail")) if lines else ""

@@ -1,0 +1,169 @@
+"""Self-Consistency (Wang et al., 2023): independent chains of thought, and a majority vote over their actions.
+
+The chains are samples of one prompt at a temperature above 0. What is counted are *canonical* actions, however they were
+written; an answer without a legal action has no vote; of equally frequent actions the one that came first wins. In menu
+mode every chain is followed by its own constrained choice, in a prompt that holds that chain alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from agentspec.llm.base import Message, assistant, user
+from agentspec.protocols import Services
+from agentspec.reasoning.common import (
+    MENU_ANSWER,
+    Stateless,
+    at_least,
+    canonical,
+    read_action,
+    sampled,
+    settings,
+    static_prompt,
+    user_turn,
+)
+from agentspec.reasoning.cot import THINK, THINK_THEN_CALL
+from agentspec.reasoning.search.meter import Ask, Meter
+from agentspec.registry import SpecError
+from agentspec.types import Action, ActionSchema, AgentInput, Decision, Recall
+
+PRESETS = {"paper": {"samples": 5}, "rl": {"samples": 3}}
+
+
+@dataclass(frozen=True)
+class Vote:
+    """One answer: its action, its text, and the completions that make it up."""
+
+    action: Action
+    rationale: str
+    calls: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Votes per action, most frequent first, earlier first among equals."""
+
+    groups: tuple[tuple[Vote, ...], ...]
+
+    @classmethod
+    def of(cls, votes: Sequence[Vote], schema: ActionSchema) -> Tally:
+        """Count ``votes`` over canonical actions."""
+        groups: dict[Hashable, list[Vote]] = {}
+        for vote in votes:
+            groups.setdefault(canonical(vote.action, schema), []).append(vote)
+        return cls(tuple(tuple(g) for g in sorted(groups.values(), key=len, reverse=True)))  # sorted() is stable
+
+    @property
+    def winner(self) -> Vote | None:
+        """The first vote for the winning action."""
+        return self.groups[0][0] if self.groups else None
+
+    @property
+    def shares(self) -> tuple[tuple[str, float], ...]:
+        """(action text, share of the votes)."""
+        total = sum(len(g) for g in self.groups)
+        return tuple((g[0].action.text, len(g) / total) for g in self.groups)
+
+
+class SelfConsistency(Stateless):
+    """A vote over independent chains.
+
+    Args:
+        preset: ``paper`` (5 samples, as AgentSpec) or ``rl`` (3).
+        samples: chains per decision.
+        sampling_temperature: temperature of the chains; above 0, or they would not be independent.
+        credit: which completions are credited as executed: those of the answer ``returned``, or of the whole
+            ``majority``; the others are credited as explored.
+        memory_tokens: budget of what memory adds to the prompt.
+        thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
+    """
+
+    def __init__(
+        self,
+        services: Services,
+        preset: str = "paper",
+        samples: int | None = None,
+        sampling_temperature: float = 0.7,
+        credit: str = "returned",
+        memory_tokens: int = 512,
+        thought_tokens: int | None = None,
+    ) -> None:
+        chosen = settings("self_consistency", PRESETS, preset, {"samples": samples})
+        at_least("self_consistency", 1, samples=chosen["samples"])
+        if sampling_temperature <= 0:
+            raise SpecError(
+                f"self_consistency: sampling_temperature must be above 0, got {sampling_temperature}; greedy samples "
+                "are all the same and cannot vote"
+            )
+        if credit not in ("returned", "majority"):
+            raise SpecError(f"self_consistency: credit must be 'returned' or 'majority', got {credit!r}")
+        self.services = services
+        self.samples: int = chosen["samples"]
+        self.credit = credit
+        self.memory_tokens = memory_tokens
+        self.sampling: dict[str, Any] = {"temperature": sampling_temperature}
+        self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
+
+    async def decide(self, input: AgentInput, recall: Recall) -> Decision:
+        schema = input.action_schema
+        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        messages = self.services.context.prompt(static_prompt(input, THINK if schema.choices else THINK_THEN_CALL), dynamic)
+        meter = Meter(self.services.llm)
+        answers = await (self._choose if schema.choices else self._answer)(meter, messages, schema)
+        votes = [a for a in answers if isinstance(a, Vote)]
+        tally = Tally.of(votes, schema)
+        trace = {"method": "self_consistency", "votes": [len(g) for g in tally.groups], "dropped": len(answers) - len(votes)}
+        winner = tally.winner
+        if winner is None:
+            first = next((a for a in answers if isinstance(a, str)), "")
+            return meter.undecided(first, trace)
+        credited = tally.groups[0] if self.credit == "majority" else (winner,)
+        return Decision(
+            winner.action,
+            rationale=winner.rationale,
+            candidates=tally.shares,
+            calls=tuple(dict.fromkeys(c for vote in credited for c in vote.calls)),
+            turn=(winner.action.text,),
+            trace={**trace, **meter.trace()},
+        )
+
+    async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | str]:
+        """Chain and action in one completion; the text of what holds no action."""
+        asked = await meter.ask_all(
+            [Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
+        )
+        answers: list[Vote | str] = []
+        for call in asked:
+            for i, completion in enumerate(call.completions):
+                action = read_action(completion.text, schema)
+                legal = isinstance(action, Action)
+                answers.append(Vote(action, completion.text, ((call.id, i),)) if legal else completion.text)  # type: ignore[arg-type]
+        return answers
+
+    async def _choose(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | str]:
+        """Chains as samples of one request, then one constrained choice after each of them, asked together."""
+        asked = await meter.ask_all(
+            [Ask("think", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
+        )
+        if not asked:
+            return []
+        chains = asked[0]
+        asks = [
+            Ask(
+                "act",
+                (*messages, assistant(sampled(chains, i)), user(MENU_ANSWER)),
+                {"choices": schema.choices, **self.sampling},
+                credit="explored",
+            )
+            for i in range(len(chains.completions))
+        ]
+        answers: list[Vote | str] = []
+        for i, call in enumerate(await meter.ask_all(asks)):
+            action = read_action(call.text, schema)
+            if isinstance(action, Action):
+                answers.append(Vote(action, chains.completions[i].text, ((chains.id, i), (call.id, 0))))
+            else:
+                answers.append(call.text)
+        return answers

@@ -1,0 +1,285 @@
+"""One update on the same rows: prefix-tree packing beside stock TRL's padded rows.
+
+    python -m benchmarks.training_step [--json] [--rollouts 8] [--turns 8] [--repeats 3]
+
+Rows have the shape of real episodes in three layouts (token counts of the quick-start: a static prompt, an observation
+and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one per summary
+segment. Both sides see the same tokens, masks and advantages and the same LoRA policy; they run in turn, A B A B, in one
+process, and the median is reported. Stock TRL gets its own batches: prompts padded left, completions padded right, the
+rows of a micro-batch as they come. ``max_rel_grad_diff`` is the largest relative difference of a parameter's gradient.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+LAYOUTS = ("conversation", "snapshot", "supo")
+STATIC, OBSERVATION, ANSWER, SUMMARY, SEGMENT = 300, 120, 8, 60, 8
+
+
+def make_rows(layout: str, rollouts: int, turns: int, vocabulary: int, seed: int = 0) -> list[Any]:
+    """Rows of ``rollouts`` episodes in groups of four that start alike; the answers are trained."""
+    from trainers.batches import Row
+    from trainers.sequences import TokenSequence
+
+    rng = random.Random(seed)
+
+    def draw(n: int) -> list[int]:
+        return [rng.randrange(100, vocabulary) for _ in range(n)]
+
+    static, rows = draw(STATIC), []
+    first: list[int] = []
+    for episode in range(rollouts):
+        if episode % 4 == 0:
+            first = draw(OBSERVATION)
+        advantage = rng.choice((-1.3, -0.4, 0.6, 1.1))
+        carried: list[int] = []
+        sequence: TokenSequence | None = None
+        for turn in range(turns):
+            observation = first if turn == 0 else draw(OBSERVATION + rng.randrange(-20, 20))
+            if layout == "supo" and turn and turn % SEGMENT == 0 and sequence is not None:
+                summary = draw(SUMMARY)
+                sequence.extend_context(draw(20))
+                _trained(sequence, summary)
+                carried, sequence = summary, None
+            if sequence is None or layout == "snapshot":
+                sequence = TokenSequence()
+                sequence.extend_context([*static, *carried])
+                rows.append(Row(sequence, advantage, episode))
+            sequence.extend_context(observation)
+            _trained(sequence, draw(ANSWER))
+    return rows
+
+
+def _trained(sequence: Any, tokens: Sequence[int]) -> None:
+    start = len(sequence)
+    sequence.extend_context(list(tokens))
+    for p in range(start, len(sequence)):
+        sequence.mask[p] = 1
+
+
+def stock_update(trainer: Any, rows: Sequence[Any], micro: int) -> Callable[[], None]:
+    """Forward and backward of ``rows`` as stock ``GRPOTrainer`` does it, ``micro`` rows at a time."""
+    from trl.trainer.utils import pad
+
+    total = torch.tensor(sum(r.sequence.trained for r in rows))
+    heads = [r.sequence.mask.index(1) for r in rows]
+
+    def tensor(values: list[list[int]], side: str, value: int) -> torch.Tensor:
+        padded: torch.Tensor = pad([torch.tensor(v) for v in values], padding_value=value, padding_side=side)
+        return padded
+
+    batch = {
+        "prompt_ids": tensor([r.sequence.tokens[:h] for r, h in zip(rows, heads, strict=True)], "left", 0),
+        "prompt_mask": tensor([[1] * h for h in heads], "left", 0),
+        "completion_ids": tensor([r.sequence.tokens[h:] for r, h in zip(rows, heads, strict=True)], "right", 0),
+        "completion_mask": tensor([[1] * (len(r.sequence) - h) for r, h in zip(rows, heads, strict=True)], "right", 0),
+        "tool_mask": tensor([r.sequence.mask[h:] for r, h in zip(rows, heads, strict=True)], "right", 0),
+        "advantages": torch.tensor([r.advantage for r in rows]),
+    }
+    count = -(-len(rows) // micro)
+    _accumulate(trainer, count)
+
+    def run() -> None:
+        for start in range(0, len(rows), micro):
+            part = {k: v[start : start + micro] for k, v in batch.items()}
+            trainer._compute_loss(trainer.model, part | {"num_items_in_batch": total}).backward()
+
+    return run
+
+
+def our_update(trainer: Any, rows: Sequence[Any], count: int) -> Callable[[], None]:
+    """Forward and backward of the same rows as ``ScaffoldGRPOTrainer`` does it."""
+    _accumulate(trainer, count)
+
+    def run() -> None:
+        for part in trainer._micro_batches(rows, count):
+            trainer._compute_loss(trainer.model, part).backward()
+
+    return run
+
+
+def _accumulate(trainer: Any, count: int) -> None:
+    """One optimiser step of ``count`` micro-batches, on-policy."""
+    trainer.current_gradient_accumulation_steps = count
+    trainer.args.gradient_accumulation_steps = count
+    trainer.args.steps_per_generation = count
+
+
+def trainers_for(model_name: str) -> tuple[Any, Any]:
+    """A stock and one of our trainers over equal LoRA policies."""
+    from datasets import Dataset
+    from trl import GRPOConfig, GRPOTrainer
+
+    from agentspec.types import Task
+    from trainers.config import ScaffoldConfig
+    from trainers.grpo import ScaffoldGRPOTrainer
+    from trainers.policy import load_policy
+    from trainers.rollouts import task_rows
+
+    common: dict[str, Any] = {
+        "output_dir": tempfile.mkdtemp(),
+        "use_cpu": not torch.cuda.is_available(),
+        "bf16": False,
+        "report_to": [],
+        "gradient_checkpointing": False,
+        "num_generations": 2,
+        "per_device_train_batch_size": 2,
+        "loss_type": "dapo",
+    }
+    config = ScaffoldConfig(**common, model=model_name, packing="tree")
+    built = []
+    for kind in ("stock", "ours"):
+        model, tokenizer = load_policy(config)
+        with torch.no_grad():  # LoRA's second factor starts at zero, which would leave most gradients zero
+            generator = torch.Generator().manual_seed(7)
+            for name, parameter in model.named_parameters():
+                if "lora_B" in name:
+                    parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.01)
+        if kind == "stock":
+            args = GRPOConfig(**common)
+            data = Dataset.from_list([{"prompt": "x"}] * 2)
+            built.append(GRPOTrainer(model, lambda **_: [0.0], args, data, processing_class=tokenizer))
+        else:
+            data = Dataset.from_list(task_rows([Task("toy", 0), Task("toy", 1)]))
+            built.append(ScaffoldGRPOTrainer(model, config, train_dataset=data, processing_class=tokenizer))
+    for trainer in built:
+        trainer.model.train()
+    return built[0], built[1]
+
+
+def gradients(trainer: Any) -> dict[str, torch.Tensor]:
+    """Gradients of the last update, cleared for the next."""
+    named = {n: p.grad.clone() for n, p in trainer.model.named_parameters() if p.grad is not None}
+    trainer.model.zero_grad(set_to_none=True)
+    return named
+
+
+def measure(run: Callable[[], None]) -> tuple[float, float]:
+    """Seconds and peak additional memory (MB) of one call."""
+    with PeakMemory() as memory:
+        start = time.perf_counter()
+        run()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - start
+    return seconds, memory.peak_mb
+
+
+class PeakMemory:
+    """Peak memory above the start: CUDA's own counter, or the resident set polled every 5 ms."""
+
+    def __enter__(self) -> PeakMemory:
+        import threading
+
+        self.peak_mb = 0.0
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
+            self._start = torch.cuda.memory_allocated() / 2**20
+            return self
+        self._start = _rss_mb()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._poll, daemon=True)
+        self._thread.start()
+        return self
+
+    def _poll(self) -> None:
+        while not self._stop.wait(0.005):
+            self.peak_mb = max(self.peak_mb, _rss_mb() - self._start)
+
+    def __exit__(self, *_: object) -> None:
+        if torch.cuda.is_available():
+            self.peak_mb = torch.cuda.max_memory_allocated() / 2**20 - self._start
+            return
+        self._stop.set()
+        self._thread.join()
+        self.peak_mb = max(self.peak_mb, _rss_mb() - self._start)
+
+
+def _rss_mb() -> float:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+
+
+def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) -> dict[str, float]:
+    """Both sides in turn on one layout."""
+    from trainers.tree import build_tree
+
+    vocabulary = int(ours.model.get_input_embeddings().weight.shape[0])
+    rows = make_rows(layout, options.rollouts, options.turns, vocabulary)
+    theirs, mine = stock_update(stock, rows, options.micro), our_update(ours, rows, options.ours_micro)
+    times: dict[str, list[float]] = {"trl": [], "ours": []}
+    memory: dict[str, list[float]] = {"trl": [], "ours": []}
+    grads: dict[str, dict[str, torch.Tensor]] = {}
+    for _ in range(options.repeats):
+        for name, trainer, update in (("trl", stock, theirs), ("ours", ours, mine)):
+            _release()
+            seconds, peak = measure(update)
+            times[name].append(seconds)
+            memory[name].append(peak)
+            grads[name] = gradients(trainer)
+    difference = max(
+        float((grads["ours"][n] - g).norm() / g.norm()) for n, g in grads["trl"].items() if float(g.norm()) > 0
+    )
+    ours_s, trl_s = statistics.median(times["ours"]), statistics.median(times["trl"])
+    return {
+        "ours_s": ours_s,
+        "trl_s": trl_s,
+        "ratio": trl_s / ours_s,
+        "ours_mb": statistics.median(memory["ours"]),
+        "trl_mb": statistics.median(memory["trl"]),
+        "memory_ratio": statistics.median(memory["trl"]) / max(1.0, statistics.median(memory["ours"])),
+        "max_rel_grad_diff": difference,
+        "packing_ratio": build_tree([r.sequence.tokens for r in rows]).packing_ratio,
+        "rows": len(rows),
+    }
+
+
+def _release() -> None:
+    """Give freed memory back to the system, so that the next peak is its own."""
+    import ctypes
+    import gc
+
+    gc.collect()
+    if sys.platform == "linux":
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def main() -> None:
+    """Run all layouts and print a table, or JSON."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--model", default="smollm2-135m")
+    parser.add_argument("--rollouts", type=int, default=8)
+    parser.add_argument("--turns", type=int, default=12)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--micro", type=int, default=4, help="rows per micro-batch of stock TRL")
+    parser.add_argument("--ours-micro", type=int, default=2, help="micro-batches of our update")
+    parser.add_argument("--layouts", nargs="*", default=list(LAYOUTS))
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    stock, ours = trainers_for(options.model)
+    results = {layout: run_layout(layout, stock, ours, options) for layout in options.layouts}
+    if options.json:
+        print(json.dumps(results))
+        return
+    for layout, r in results.items():
+        print(
+            f"{layout:<13} ours {r['ours_s']:7.2f} s  trl {r['trl_s']:7.2f} s  ratio {r['ratio']:.2f}x  "
+            f"memory {r['memory_ratio']:.2f}x  gradient difference {r['max_rel_grad_diff']:.1e}  "
+            f"packing {r['packing_ratio']:.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Sets of tasks: what one table of an evaluation is about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.types import Task
+
+Tasks = Sequence[Task] | Mapping[str, Sequence[Task]]
+"""Tasks to split by environment and options, or labelled sets of them."""
+
+
+def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
+    """Labelled sets of tasks; a plain sequence is split by environment and options.
+
+    Raises:
+        SpecError: no task at all, or one task given twice.
+    """
+    if isinstance(tasks, Mapping):
+        sets = {label: list(members) for label, members in tasks.items()}
+    else:
+        groups: dict[str, list[Task]] = {}
+        for task in tasks:
+            groups.setdefault(replace(task, seed=0).key, []).append(task)
+        sets = {}
+        names = [environment_name(members[0].env) for members in groups.values()]
+        for name, members in zip(names, groups.values(), strict=True):
+            options = " ".join(f"{k}={v}" for k, v in members[0].options.items()) if names.count(name) > 1 else ""
+            label = f"{name} {options}".strip()
+            sets[label if label not in sets else f"{label} ({members[0].split})"] = members
+    keys = [task.key for members in sets.values() for task in members]
+    if not keys or len(set(keys)) < len(keys):
+        problem = "no tasks" if not keys else f"{len(keys) - len(set(keys))} of {len(keys)} tasks are given twice"
+        raise SpecError(f"{problem}; give each task (environment, options, seed) exactly once")
+    return sets
+
+
+def environment_name(env: str) -> str:
+    """The registered short name of an environment, or its id."""
+    return next((name for name, entry in REGISTRY.entries.get("env", {}).items() if entry.target == env), env)

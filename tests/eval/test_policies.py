@@ -1,0 +1,52 @@
+"""Policies: how they are named, what they do to a scaffold, and when two are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
+from eval.policies import Policy, needs_model, weights_digest
+
+
+def test_parse(tmp_path: Path) -> None:
+    assert Policy.parse("rule-based") == Policy("rule_based")
+    assert Policy.parse("smollm2-135m") == Policy("smollm2-135m", "smollm2-135m")
+    assert Policy.parse("tuned=smollm2-135m+runs/x") == Policy("tuned", "smollm2-135m", "runs/x")
+    assert Policy.parse(str(tmp_path)).name == tmp_path.name  # a folder is called by its last part
+    for text in ("=model", "name=", ""):
+        with pytest.raises(SpecError, match="NAME=MODEL"):
+            Policy.parse(text)
+
+
+def test_a_scripted_policy_takes_the_place_of_reasoning() -> None:
+    spec = AgentSpec.from_data({"reasoning": "react", "memory": {"name": "base", "window": 3}})
+    played = Policy("random").apply(spec)
+    assert played.reasoning.name == "random" and played.memory == spec.memory and not needs_model(played)
+    assert Policy("m", "some-model").apply(spec) is spec and needs_model(spec)
+
+
+def test_a_model_may_be_called_like_a_scripted_policy() -> None:
+    assert Policy("random").scripted == "random"
+    assert Policy("random", "some-model").scripted == ""
+
+
+def test_settings_of_the_backend() -> None:
+    assert Policy("m").settings() == {"backend": "local", "model": "m"}
+    policy = Policy("x", "m", "a", {"dtype": "float32"})
+    assert policy.settings() == {"backend": "local", "model": "m", "adapter": "a", "dtype": "float32"}
+    scripted = Policy("x", backend={"backend": "scripted", "script": ["WAIT()"]})
+    assert scripted.settings() == {"backend": "scripted", "script": ["WAIT()"]}
+
+
+def test_retrained_weights_are_another_policy(tmp_path: Path) -> None:
+    weights = tmp_path / "adapter_model.safetensors"
+    weights.write_bytes(b"a" * 100)
+    policy = Policy("tuned", "base", str(tmp_path))
+    before = policy.identity()
+    assert policy.identity() == before
+    weights.write_bytes(b"a" * 99 + b"b")
+    assert policy.identity() != before
+    assert weights_digest(tmp_path) in policy.identity()["weights"]

@@ -1,0 +1,117 @@
+"""Summaries and tables of rows written by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from eval.plots import matrix_heatmap, reward_curve, running_mean
+from eval.statistics import Estimate
+from eval.tables import differences, markdown, show, summarise, table, write_report
+
+
+def row(policy: str, task: str, profit: float | None, *, scaffold: str = "plain", **changes: Any) -> dict[str, Any]:
+    return {
+        "tasks": "city",
+        "policy": policy,
+        "scaffold": scaffold,
+        "task": task,
+        "rollout": 0,
+        "status": "completed",
+        "ended": "environment",
+        "hourly_profit": profit,
+        "steps": 10,
+    } | changes
+
+
+ROWS = [
+    row("base", "a", 1.0),
+    row("base", "b", 3.0),
+    row("base", "c", None, status="failed"),
+    row("tuned", "a", 5.0, rollout=0),
+    row("tuned", "a", 7.0, rollout=1),
+    row("tuned", "b", 8.0, ended="budget"),
+    row("tuned", "c", 100.0),
+]
+
+
+def test_summaries_count_what_they_leave_out() -> None:
+    base, tuned = summarise(ROWS)
+    assert (base.episodes, base.failed, base.cut_short) == (3, 1, 0)
+    assert (tuned.episodes, tuned.failed, tuned.cut_short) == (4, 0, 1)
+    assert base.estimates["hourly_profit"].mean == 2.0  # (1 + 3) / 2: the failed one is left out
+    # Rollouts of a task are averaged first: ((5 + 7) / 2 + 8 + 100) / 3 = 38
+    assert tuned.estimates["hourly_profit"].mean == pytest.approx(38.0)
+    assert tuned.estimates["hourly_profit"].n == 3
+    assert "cost" not in base.estimates
+
+
+def test_differences_are_paired_by_task() -> None:
+    [difference] = differences(ROWS, "hourly_profit")
+    # Tasks a and b: 6 - 1 = 5 and 8 - 3 = 5; task c has no number for the baseline.
+    assert difference == {
+        "tasks": "city",
+        "scaffold": "plain",
+        "policy": "tuned",
+        "baseline": "base",
+        "mean": 5.0,
+        "low": 5.0,
+        "high": 5.0,
+        "n": 2,
+    }
+    assert differences(ROWS, "hourly_profit", by="scaffold") == []
+    with pytest.raises(ValueError, match="'policy' or 'scaffold'"):
+        differences(ROWS, "hourly_profit", by="task")
+
+
+def test_markdown_has_matrix_details_and_differences() -> None:
+    rows = [*ROWS, row("base", "a", 2.0, scaffold="react|x"), row("base", "b", 5.0, scaffold="react|x")]
+    text = markdown(rows)
+    assert "## city: hourly profit ($/h)" in text
+    assert "| policy | plain | react\\|x |" in text
+    assert "| base | 2.00 [1.00, 3.00] | 3.50 [2.00, 5.00] |" in text
+    assert "| tuned | 38.00 [6.00, 100.00] | – |" in text
+    assert "| base | plain | 3 | 1 | 0 | 2.00 | 10.0 |" in text
+    assert "| plain | tuned - base | 5.00 [5.00, 5.00] | 2 |" in text
+    # by scaffold: 2 - 1 = 1 and 5 - 3 = 2
+    assert "| base | react\\|x - plain | 1.50 [1.00, 2.00] | 2 |" in text
+    assert markdown([]) == "No episodes.\n"
+
+
+def test_show_and_table() -> None:
+    assert show(None, 2) == "–"
+    assert show(Estimate(1.234, math.nan, math.nan, 1), 1) == "1.2"
+    assert table(["a"], [["b"]]) == ["| a |", "| --- |", "| b |"]
+
+
+def test_the_report_is_written_beside_the_rows(tmp_path: Path) -> None:
+    write_report(ROWS, tmp_path)
+    data = json.loads((tmp_path / "summary.json").read_text())
+    assert data["level"] == 0.95 and data["cells"][0]["estimates"]["hourly_profit"]["mean"] == 2.0
+    assert (tmp_path / "results.md").read_text() == markdown(ROWS)
+
+
+def test_running_mean() -> None:
+    # 1; (1+3)/2; (3+5)/2; (5+7)/2
+    assert running_mean(np.array([1.0, 3.0, 5.0, 7.0]), 2).tolist() == [1.0, 2.0, 4.0, 6.0]
+
+
+def test_plots_are_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = [{"step": i, "reward": i / 10, "reward_std": 0.1} for i in range(8)] + [{"step": 8, "train_runtime": 1.0}]
+    assert reward_curve(rows, tmp_path / "curve.png")
+    two = [*ROWS, row("base", "a", 2.0, tasks="town")]
+    assert matrix_heatmap(summarise(two), tmp_path / "matrix.png", metric="hourly_profit")
+    for name in ("curve.png", "matrix.png"):
+        with Image.open(tmp_path / name) as image:
+            assert image.width > 300 and image.height > 200
+    assert not reward_curve([{"step": 1, "loss": 2.0}], tmp_path / "none.png")
+    assert not matrix_heatmap([], tmp_path / "none.png") and not (tmp_path / "none.png").exists()
+    with pytest.raises(ValueError, match="unknown metric"):
+        matrix_heatmap(summarise(ROWS), tmp_path / "none.png", metric="profit")
