@@ -29,6 +29,7 @@ from agentspec.types import Task, Transition
 T = TypeVar("T")
 MakeEnv = Callable[[Task], Any]
 
+
 def environment_id(name: str) -> str:
     """The gymnasium id of a registered short name (ids pass through)."""
     import gymnasium

@@ -22,6 +22,7 @@ import torch
 
 _ROUND = 64
 _GROWTH = 1.25
+_BONUS = 16
 
 
 class Slot:
@@ -135,7 +136,7 @@ class PrefixCache:
             self._clock += 1
             arrays = [np.asarray(tokens[:limit], np.int32) for tokens, limit, _, _ in prompts]
             # All are matched before any slot is taken, and all copies are made before any slot is written.
-            matches = [self._match(array) for array in arrays]
+            matches = [self._match(a, owner) for a, (_, _, owner, _) in zip(arrays, prompts, strict=True)]
             taken: dict[int, Slot] = {}
             for i, (match, (_, _, owner, _)) in enumerate(zip(matches, prompts, strict=True)):
                 slot = match.slot
@@ -168,13 +169,15 @@ class PrefixCache:
             self._slots.append(slot)
             self._trim(0)
 
-    def _match(self, prompt: np.ndarray) -> Match:
-        best = Match()
+    def _match(self, prompt: np.ndarray, owner: str) -> Match:
+        best, rank = Match(), (0, 0)
         for slot in self._slots:
             length = common_prefix(slot.tokens, prompt)
-            # Of equal prefixes the slot with the least behind it: the one that can be continued.
-            if length > best.length or (length == best.length > 0 and best.slot and slot.length < best.slot.length):
-                best = Match(slot, length)
+            # A slot that may be continued is worth a few tokens: it saves a copy and the memory of another slot.
+            bonus = _BONUS if self._may_continue(slot, length, owner) else 0
+            candidate = (length + bonus, -slot.length)
+            if length and (best.slot is None or candidate > rank):
+                best, rank = Match(slot, length), candidate
         if best.slot is not None:
             best.slot.used = self._clock
         return best

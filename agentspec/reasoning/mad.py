@@ -21,7 +21,6 @@ from agentspec.reasoning.common import (
     Stateless,
     at_least,
     clip,
-    read_action,
     sampled,
     settings,
     static_prompt,
@@ -29,8 +28,8 @@ from agentspec.reasoning.common import (
     with_request,
 )
 from agentspec.reasoning.search.meter import Ask, Meter
-from agentspec.reasoning.self_consistency import Tally, Vote
-from agentspec.types import Action, ActionSchema, AgentInput, Decision, Recall
+from agentspec.reasoning.self_consistency import Tally, Vote, vote
+from agentspec.types import ActionSchema, AgentInput, Decision, Recall
 
 PRESETS = {
     "paper": {"num_agents": 3, "num_rounds": 2, "argue": True},
@@ -135,12 +134,10 @@ class MultiAgentDebate(Stateless):
                 return
         sampling = {"choices": schema.choices} if schema.choices else self.limit
         for i, call in enumerate(await meter.ask_all([Ask("act", a.messages, sampling, "explored") for a in advisers])):
-            action = read_action(call.text, schema)
             text = f"{words[i]}Action: {call.text}" if words[i] else call.text
             advisers[i].messages = (*advisers[i].messages, assistant(sampled(call)))
             advisers[i].texts.append(text)
-            legal = isinstance(action, Action)
-            advisers[i].votes.append(Vote(action, text, (*arguments[i], (call.id, 0))) if legal else None)  # type: ignore[arg-type]
+            advisers[i].votes.append(vote(call.text, text, schema, (*arguments[i], (call.id, 0))))
 
     def _vote(self, meter: Meter, advisers: Sequence[Adviser], schema: ActionSchema) -> Decision:
         """The majority of each agent's last answers; if none of them is legal, of the newest round that has one."""
@@ -149,7 +146,8 @@ class MultiAgentDebate(Stateless):
             "method": "mad",
             "rounds": [[v.action.text if v else None for v in votes] for votes in rounds if votes],
         }
-        last = Tally.of([a.votes[-1] for a in advisers if a.votes and a.votes[-1] is not None], schema)  # type: ignore[misc]
+        newest = [a.votes[-1] for a in advisers if a.votes]
+        last = Tally.of([v for v in newest if v is not None], schema)
         if last.winner is not None:
             return _decision(last, {**trace, **meter.trace()}, valid=True)
         for number in range(len(rounds) - 2, -1, -1):
@@ -157,7 +155,7 @@ class MultiAgentDebate(Stateless):
             if earlier.winner is not None:
                 fallback = f"no legal answer in the last round; the vote of round {number}"
                 return _decision(earlier, {**trace, **meter.trace(), "fallback": fallback}, valid=False)
-        return meter.undecided(next((a.texts[-1] for a in advisers if a.texts), ""), trace)
+        return meter.undecided(trace)
 
 
 def _decision(tally: Tally, trace: dict[str, Any], *, valid: bool) -> Decision:

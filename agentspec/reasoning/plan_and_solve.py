@@ -144,7 +144,9 @@ class PlanAndSolve:
         request = self.request
         if why:
             failures = "; ".join(self._failures)
-            shown = f"What failed: {clip(failures, self.feedback_tokens, self.services, keep='tail')}. " if failures else ""
+            shown = (
+                f"What failed: {clip(failures, self.feedback_tokens, self.services, keep='tail')}. " if failures else ""
+            )
             request = f"{REPLAN.format(why=why, failures=shown)}\n{request}"
         messages = self.services.context.prompt(static, f"{dynamic}\n\n{request}")
         call = await self.services.llm.generate("plan", messages, max_tokens=self.plan_tokens)

@@ -41,6 +41,12 @@ class Vote:
     calls: tuple[tuple[int, int], ...]
 
 
+def vote(text: str, rationale: str, schema: ActionSchema, calls: tuple[tuple[int, int], ...]) -> Vote | None:
+    """The vote of an answer; ``None`` if it holds no legal action."""
+    action = read_action(text, schema)
+    return Vote(action, rationale, calls) if isinstance(action, Action) else None
+
+
 @dataclass(frozen=True)
 class Tally:
     """Votes per action, most frequent first, earlier first among equals."""
@@ -109,16 +115,21 @@ class SelfConsistency(Stateless):
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         schema = input.action_schema
         dynamic = user_turn(input, recall, self.services, self.memory_tokens)
-        messages = self.services.context.prompt(static_prompt(input, THINK if schema.choices else THINK_THEN_CALL), dynamic)
+        messages = self.services.context.prompt(
+            static_prompt(input, THINK if schema.choices else THINK_THEN_CALL), dynamic
+        )
         meter = Meter(self.services.llm)
         answers = await (self._choose if schema.choices else self._answer)(meter, messages, schema)
-        votes = [a for a in answers if isinstance(a, Vote)]
+        votes = [a for a in answers if a is not None]
         tally = Tally.of(votes, schema)
-        trace = {"method": "self_consistency", "votes": [len(g) for g in tally.groups], "dropped": len(answers) - len(votes)}
+        trace = {
+            "method": "self_consistency",
+            "votes": [len(g) for g in tally.groups],
+            "dropped": len(answers) - len(votes),
+        }
         winner = tally.winner
         if winner is None:
-            first = next((a for a in answers if isinstance(a, str)), "")
-            return meter.undecided(first, trace)
+            return meter.undecided(trace)
         credited = tally.groups[0] if self.credit == "majority" else (winner,)
         return Decision(
             winner.action,
@@ -129,20 +140,18 @@ class SelfConsistency(Stateless):
             trace={**trace, **meter.trace()},
         )
 
-    async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | str]:
-        """Chain and action in one completion; the text of what holds no action."""
+    async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
+        """Chain and action in one completion; ``None`` for an answer without a legal action."""
         asked = await meter.ask_all(
             [Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
         )
-        answers: list[Vote | str] = []
+        answers: list[Vote | None] = []
         for call in asked:
             for i, completion in enumerate(call.completions):
-                action = read_action(completion.text, schema)
-                legal = isinstance(action, Action)
-                answers.append(Vote(action, completion.text, ((call.id, i),)) if legal else completion.text)  # type: ignore[arg-type]
+                answers.append(vote(completion.text, completion.text, schema, ((call.id, i),)))
         return answers
 
-    async def _choose(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | str]:
+    async def _choose(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
         """Chains as samples of one request, then one constrained choice after each of them, asked together."""
         asked = await meter.ask_all(
             [Ask("think", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
@@ -159,11 +168,7 @@ class SelfConsistency(Stateless):
             )
             for i in range(len(chains.completions))
         ]
-        answers: list[Vote | str] = []
+        answers: list[Vote | None] = []
         for i, call in enumerate(await meter.ask_all(asks)):
-            action = read_action(call.text, schema)
-            if isinstance(action, Action):
-                answers.append(Vote(action, chains.completions[i].text, ((chains.id, i), (call.id, 0))))
-            else:
-                answers.append(call.text)
+            answers.append(vote(call.text, chains.completions[i].text, schema, ((chains.id, i), (call.id, 0))))
         return answers

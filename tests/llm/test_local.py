@@ -282,6 +282,15 @@ def test_side_calls_do_not_cost_the_conversation_its_cache():
     assert later.usage.cached_tokens >= len(first.prompt_ids)
 
 
+def test_rebuilt_prompts_keep_one_slot_per_episode():
+    llm = tiny()
+    for step in range(4):
+        for name in "ab":
+            call = ask(llm, system("rules " * 20), user(f"state {step} of {name}"), episode=name, max_tokens=2)
+    assert call.usage.cached_tokens > 120
+    assert len(llm._engine.cache) == 2
+
+
 def test_changed_weights_drop_the_cache():
     llm = tiny()
     before = ask(llm, max_tokens=4)

@@ -25,20 +25,31 @@ class Problem(Protocol):
         ...
 
 
-async def search(root: Node, problem: Problem, *, iterations: int, depth: int, weight: float) -> None:
+async def search(
+    root: Node,
+    problem: Problem,
+    *,
+    iterations: int,
+    depth: int,
+    weight: float,
+    record: list[tuple[float, list[Node]]] | None = None,
+) -> None:
     """Grow the tree under ``root``, whose state is given.
 
     Args:
         iterations: paths to sample.
         depth: most steps of a path.
         weight: exploration weight of UCT.
+        record: takes (return, path) of every iteration.
     """
     for _ in range(iterations):
         path = select(root, weight, depth)
         if path[-1].state is None or not _ended(path[-1], depth):
             await _expand(path[-1], problem, depth)
             await _simulate(path, problem, depth)
-        backpropagate(path)
+        total = backpropagate(path)
+        if record is not None:
+            record.append((total, path))
         if not root.children:
             return  # nothing can be done from here
 

@@ -43,6 +43,7 @@ class Meter:
 
     Attributes:
         exhausted: what ran out: ``"calls"``, ``"tokens"``, ``"episode"`` (its budget), ``"context"``, or empty.
+        answered: the first answer that proposed an action, for messages about what could not be read.
     """
 
     def __init__(self, llm: ModuleLLM, calls: int | None = None, tokens: int | None = None) -> None:
@@ -52,6 +53,7 @@ class Meter:
         self.scorings = 0
         self.tokens = 0
         self.exhausted = ""
+        self.answered = ""
         self._error: LLMError | None = None
 
     @property
@@ -95,6 +97,7 @@ class Meter:
         call = await self._llm.generate(ask.purpose, ask.messages, **ask.sampling)
         self.tokens += call.usage.input_tokens + call.usage.output_tokens
         if ask.credit != "aux":
+            self.answered = self.answered or call.text
             for i in range(len(call.completions)):
                 self._llm.recorder.credit(call.id, i, ask.credit)
         return call
@@ -145,11 +148,10 @@ class Meter:
             spent["exhausted"] = self.exhausted
         return spent
 
-    def undecided(self, answered: str, trace: Mapping[str, Any]) -> Decision:
+    def undecided(self, trace: Mapping[str, Any]) -> Decision:
         """The flagged fallback when no legal action was found: an error that the environment answers.
 
         Args:
-            answered: what the model wrote instead.
             trace: the method's trace.
 
         Raises:
@@ -157,9 +159,9 @@ class Meter:
         """
         if self._error is not None:
             raise self._error
-        message = f"no legal action was found among the answers (the first reads {answered[:60]!r})"
+        message = f"no legal action was found among the answers (the first reads {self.answered[:60]!r})"
         return Decision(
-            ActionError("NO_ACTION", message, answered[:200]),
+            ActionError("NO_ACTION", message, self.answered[:200]),
             valid=False,
             trace={**trace, **self.trace(), "fallback": "nothing parsed"},
         )

@@ -95,7 +95,14 @@ class ModelWorld:
     real = False
 
     def __init__(
-        self, meter: Meter, services: Services, base: Sequence[Message], *, tokens: int, path_tokens: int, **sampling: Any
+        self,
+        meter: Meter,
+        services: Services,
+        base: Sequence[Message],
+        *,
+        tokens: int,
+        path_tokens: int,
+        **sampling: Any,
     ) -> None:
         self._meter = meter
         self._services = services
