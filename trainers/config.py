@@ -63,6 +63,8 @@ class ScaffoldConfig(GRPOConfig):
             the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
         mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
+        memory_carry: with ``scope: run``, whose memory the next generation round starts from: the ``first`` rollout's
+            or the ``best`` one's. All rollouts of a round start from the same memory.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
@@ -94,6 +96,7 @@ class ScaffoldConfig(GRPOConfig):
     overlong: str = field(default="mask", metadata={"help": "mask, keep or drop"})
     overlong_ends: list[str] = field(default_factory=lambda: ["context"])
     mask_truncated: list[str] = field(default_factory=list)
+    memory_carry: str = field(default="first", metadata={"help": "first or best"})
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
@@ -174,6 +177,8 @@ class ScaffoldConfig(GRPOConfig):
         for end in self.overlong_ends:
             if end not in ENDS:
                 raise SpecError(f"unknown end {end!r} in overlong_ends{suggest(end, ENDS)}")
+        if self.memory_carry not in ("first", "best"):
+            raise SpecError(f"memory_carry must be 'first' or 'best', got {self.memory_carry!r}")
         if self.packing not in ("tree", "padded"):
             raise SpecError(f"packing must be 'tree' or 'padded', got {self.packing!r}")
         for credit in self.train_credits:

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate.utils import gather_object
 from torch import nn
+from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
 from trl import GRPOTrainer
 
 from agentspec.episode import MakeEnv, Runner, make_env
@@ -23,6 +25,7 @@ from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
 from trainers.config import ScaffoldConfig
+from trainers.resume import ScaffoldState, load_state, rewind_logs, rows_of, save_state
 from trainers.rollouts import collect, rollout_jobs
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
@@ -75,6 +78,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         self._make_llm = make_llm or local_llm
         self._llm: LLM | None = None
         self._round = 0
+        self._memory: bytes | None = None
 
     @property
     def last_episodes(self) -> list[Trajectory]:
@@ -114,6 +118,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             round=self._round,
             first=self.accelerator.process_index * len(rows),
             group=group,
+            memory=self._memory,
         )
         runner = Runner(
             self.args.spec,
@@ -126,8 +131,10 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         invalidate = getattr(self.llm, "invalidate", None)
         if invalidate is not None:
             invalidate()
-        self._episodes = collect(runner, jobs)
+        self._episodes = collect(runner, jobs, retries=self.args.retries)
         self._log_episodes(mode)
+        if mode == "train":
+            self._memory = self._carried_memory()
         stand_in = [self._tokenizer.pad_token_id]
         completions = [[{"role": "assistant", "content": _transcript(t)}] for t in self._episodes]
         n = len(self._episodes)
@@ -160,6 +167,17 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             )
         return weighed.rows
 
+    def _carried_memory(self) -> bytes | None:
+        """With ``scope: run``: the memory that the next round starts from, the same on every rank."""
+        if self.args.spec.scope != "run":
+            return None
+        local = [(self.rewards_used.total(t), t.memory_state) for t in self._episodes]
+        scored = [(value, state) for value, state in gather_object(local) if value is not None]
+        if not scored:
+            return self._memory
+        state: bytes | None = (scored[0] if self.args.memory_carry == "first" else max(scored, key=lambda s: s[0]))[1]
+        return state
+
     # --- updates -----------------------------------------------------------------------------------------------------
 
     def _prepare_inputs(self, generation_batch: Any) -> dict[str, Any]:
@@ -167,14 +185,18 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         if not self.model.training:
             rows = self._generate_and_score_completions(generation_batch)[ROWS]
             return self._micro_batches(rows, 1)[0]
-        rounds = self.args.steps_per_generation * self.num_iterations
-        if self._step % rounds == 0 or self._buffered_inputs is None:
+        if self._step % self._steps_per_round == 0 or self._buffered_inputs is None:
             self._round = self.state.global_step
             rows = self._generate_and_score_completions(generation_batch)[ROWS]
             self._buffered_inputs = self._micro_batches(rows, self.args.steps_per_generation)
             self._log_update(rows)
         batch: dict[str, Any] = self._buffered_inputs[self._step % self.args.steps_per_generation]
         return batch
+
+    @property
+    def _steps_per_round(self) -> int:
+        """Micro-batches between two generation rounds."""
+        return int(self.args.steps_per_generation * self.num_iterations)
 
     @property
     def _skip_silent(self) -> bool:
@@ -185,14 +207,18 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         """Deal rows into ``count`` micro-batches; every rank gets the same shape of deal."""
         device = self.accelerator.device
         sizes = self.accelerator.gather(torch.tensor([-(-max(1, len(rows)) // count)], device=device))
-        trained = torch.tensor(sum(r.sequence.trained for r in rows), device=device)
-        total = self.accelerator.gather(trained).sum()
-        pad = self._tokenizer.pad_token_id
+        blank = blank_row(self._tokenizer.pad_token_id)
         together = self.args.packing == "tree"
-        hands = deal(rows, count, blank=blank_row(pad), rows_per_hand=int(sizes.max()), together=together)
+        return self._collated(deal(rows, count, blank=blank, rows_per_hand=int(sizes.max()), together=together))
+
+    def _collated(self, hands: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
+        """What TRL's loss reads of each micro-batch; the denominator counts every trained token of all ranks."""
+        device = self.accelerator.device
+        trained = torch.tensor(sum(r.sequence.trained for hand in hands for r in hand), device=device)
+        total = self.accelerator.gather(trained).sum()
         batches = []
         for hand in hands:
-            batch: dict[str, Any] = collate(hand, pad, device, skip_silent=self._skip_silent)
+            batch: dict[str, Any] = collate(hand, self._tokenizer.pad_token_id, device, skip_silent=self._skip_silent)
             batch |= {ROWS: hand, "num_items_in_batch": total}
             if self._off_policy:
                 batch["old_per_token_logps"] = batch["sampled_logprobs"]
@@ -204,8 +230,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
     @property
     def _off_policy(self) -> bool:
         """Whether an update may see weights other than those that sampled (then the recorded log-probs are the old)."""
-        rounds = self.args.steps_per_generation * self.num_iterations
-        return bool(self.args.gradient_accumulation_steps % rounds != 0)
+        return bool(self.args.gradient_accumulation_steps % self._steps_per_round != 0)
 
     def _reference_logprobs(self, rows: Sequence[Row]) -> torch.Tensor:
         """Log-probabilities under the reference: a model of its own, or the base under the adapter."""
@@ -240,6 +265,27 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * inputs["tool_mask"]
         self._metrics[mode]["sampling/logp_difference_max"].append(difference.max().item())
         return logps, entropies, None
+
+    # --- checkpoints ---------------------------------------------------------------------------------------------
+
+    def _save_checkpoint(self, model: nn.Module, trial: Any) -> None:
+        super()._save_checkpoint(model, trial)
+        folder = Path(self._get_output_dir(trial=trial)) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
+        unused = self._step % self._steps_per_round != 0
+        buffered = rows_of(self._buffered_inputs, ROWS) if unused else ()
+        state = ScaffoldState(self._step, self._round, buffered, self._memory)
+        save_state(folder, state, self.accelerator.process_index)
+
+    def _load_optimizer_and_scheduler(self, checkpoint: str | None) -> None:
+        super()._load_optimizer_and_scheduler(checkpoint)
+        state = load_state(checkpoint, self.accelerator.process_index) if checkpoint else None
+        if state is None:
+            return
+        self._step, self._round, self._memory = state.step, state.round, state.memory
+        if state.buffered:
+            self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
+        if self.accelerator.is_main_process:
+            rewind_logs(self.run_log, self.state.global_step)
 
     # --- logs --------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from agentspec.episode import Job, Runner
@@ -45,7 +45,15 @@ def task_of(row: dict[str, Any]) -> Task:
     return Task(**json.loads(row["task"]))
 
 
-def rollout_jobs(rows: Sequence[dict[str, Any]], *, seed: int, round: int, first: int = 0, group: int = 1) -> list[Job]:
+def rollout_jobs(
+    rows: Sequence[dict[str, Any]],
+    *,
+    seed: int,
+    round: int,
+    first: int = 0,
+    group: int = 1,
+    memory: bytes | None = None,
+) -> list[Job]:
     """One job per row.
 
     Args:
@@ -54,11 +62,23 @@ def rollout_jobs(rows: Sequence[dict[str, Any]], *, seed: int, round: int, first
         round: number of the generation round; another round samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
+        memory: state that memories with ``scope: run`` start from; all rollouts of a round start alike.
     """
     run_seed = derive_seed(seed, round)
-    return [Job(task_of(row), (first + i) % group, run_seed) for i, row in enumerate(rows)]
+    return [Job(task_of(row), (first + i) % group, run_seed, memory) for i, row in enumerate(rows)]
 
 
-def collect(runner: Runner, jobs: Sequence[Job]) -> list[Trajectory]:
-    """Run the jobs; every failure is a trajectory too."""
-    return runner.run(jobs)
+def collect(runner: Runner, jobs: Sequence[Job], *, retries: int = 0) -> list[Trajectory]:
+    """Run the jobs; every failure is a trajectory too.
+
+    A failed job is run again up to ``retries`` times, each time with a seed of its own; what still fails stays failed.
+    """
+    episodes = runner.run(jobs)
+    for attempt in range(1, retries + 1):
+        failed = [i for i, t in enumerate(episodes) if not t.scorable]
+        if not failed:
+            break
+        again = [replace(jobs[i], run_seed=derive_seed(jobs[i].run_seed, "retry", attempt)) for i in failed]
+        for i, trajectory in zip(failed, runner.run(again), strict=True):
+            episodes[i] = trajectory
+    return episodes

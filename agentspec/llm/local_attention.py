@@ -1,8 +1,9 @@
 """Attention of many sequences in one row of tokens: each segment of new tokens sees its own sequence only.
 
-This is what the packed forward (:mod:`agentspec.llm.local_forward`) puts in the place of a model's attention. A segment's
-new keys and values are stored in its slot, and its queries attend to the slot. The query heads that share a key-value head
-are laid side by side as more queries of that head, so that keys and values are read once and never repeated.
+This is what the packed forward (:mod:`agentspec.llm.local_forward`) puts in the place of a model's attention. A
+segment's new keys and values are stored in its slot, and its queries attend to the slot. The query heads that share a
+key-value head are laid side by side as more queries of that head, so that keys and values are read once and never
+repeated.
 
 On a CPU segments go one by one. On an accelerator, where a launch costs more than the work, the segments of one token
 (sequences that are writing) are gathered into one padded batch.
@@ -51,9 +52,40 @@ class Segment:
 
 @dataclass
 class Pack:
+    """The segments of one forward, where each lies in the row of tokens, and masks that all layers share."""
+
     segments: Sequence[Segment]
     bounds: list[tuple[int, int]]
-    masks: dict[tuple[int, int, int, int], torch.Tensor] = field(default_factory=dict)
+    masks: dict[tuple[int, ...], torch.Tensor] = field(default_factory=dict)
+
+    def split(self, device: torch.device) -> tuple[list[int], list[int]]:
+        """Numbers of the segments to take one by one, and of those to take as one batch."""
+        numbers = range(len(self.segments))
+        single = [i for i in numbers if len(self.segments[i].tokens) == 1 and self.segments[i].source is None]
+        if len(single) < _BATCHED_FROM.get(device.type, _BATCHED_FROM_DEFAULT):
+            return list(numbers), []
+        together = set(single)
+        return [i for i in numbers if i not in together], single
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """How a layer turns queries and keys into weights."""
+
+    scaling: float | None
+    window: int
+    softcap: float | None
+    sinks: torch.Tensor | None
+
+
+@contextmanager
+def active(pack: Pack) -> Iterator[None]:
+    """The pack that :func:`packed_attention` works on, in this thread."""
+    _ACTIVE.pack = pack
+    try:
+        yield
+    finally:
+        _ACTIVE.pack = None
 
 
 def packed_attention(
@@ -68,35 +100,69 @@ def packed_attention(
     s_aux: torch.Tensor | None = None,
     **_: Any,
 ) -> tuple[torch.Tensor, None]:
-    """Attention of the active pack: ``query`` (1, heads, T, size) to each segment's own slot; (1, T, heads, size)."""
-    pack: _Pack | None = getattr(_ACTIVE, "pack", None)
+    """Attention of the active pack, with the signature transformers calls.
+
+    Args:
+        module: the attention layer (its ``layer_idx``).
+        query: (1, heads, T, size), rotated; ``key`` and ``value`` (1, key-value heads, T, size).
+        scaling, sliding_window, softcap, s_aux: as the model passes them (``s_aux``: attention sinks, one per head).
+
+    Returns:
+        Attended values (1, T, heads, size), and no weights.
+    """
+    pack: Pack | None = getattr(_ACTIVE, "pack", None)
     if pack is None:
         raise LLMError("the model was used by another thread while the local backend sampled from it; take turns")
     layer = int(module.layer_idx)  # type: ignore[arg-type]
-    heads, kv_heads = query.shape[1], key.shape[1]
-    groups = heads // kv_heads
-    out = query.new_empty(1, query.shape[2], heads, value.shape[-1])
-    for segment, (begin, end) in zip(pack.segments, pack.bounds, strict=True):
-        slot, n = segment.slot, end - begin
+    scores = _Scores(scaling, sliding_window or 0, softcap, s_aux)
+    out = query.new_empty(1, query.shape[2], query.shape[1], value.shape[-1])
+    alone, together = pack.split(query.device)
+    for i in alone:
+        begin, end = pack.bounds[i]
+        segment = pack.segments[i]
         if segment.source is not None and segment.start > segment.known:
-            slot.copy_layer(layer, segment.source, segment.known, segment.start)
-        slot.write(layer, segment.start, key[0, :, begin:end], value[0, :, begin:end])
-        total = segment.start + n
-        keys, values = slot.keys[layer], slot.values[layer]
-        assert keys is not None and values is not None
-        # Query heads of one key-value head are laid side by side as more queries: keys are read once, never repeated.
-        q = query[:, :, begin:end].reshape(1, kv_heads, groups * n, -1)
-        k, v = keys[None, :, :total], values[None, :, :total]
-        mask = _mask(pack, n, total, groups, sliding_window or 0, q)
-        if softcap is None and s_aux is None:
-            o = scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scaling)
-        else:
-            o = _attend(q, k, v, mask, scaling, softcap, s_aux)
-        out[0, begin:end] = o.reshape(heads, n, -1).transpose(0, 1)
+            segment.slot.copy_layer(layer, segment.source, segment.known, segment.start)
+        segment.slot.write(layer, segment.start, key[0, :, begin:end], value[0, :, begin:end])
+        out[0, begin:end] = _one(pack, segment, layer, query[:, :, begin:end], scores)
+    if together:
+        columns = torch.tensor([pack.bounds[i][0] for i in together], device=query.device)
+        segments = [pack.segments[i] for i in together]
+        for segment, k, v in zip(segments, key[0][:, columns].unbind(1), value[0][:, columns].unbind(1), strict=True):
+            segment.slot.write(layer, segment.start, k[:, None], v[:, None])
+        out[0, columns] = _batch(pack, segments, layer, query[0][:, columns], scores)
     return out, None
 
 
-def _mask(pack: _Pack, n: int, total: int, groups: int, window: int, like: torch.Tensor) -> torch.Tensor | None:
+def _one(pack: Pack, segment: Segment, layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
+    """One segment's queries (1, heads, n, size) to its slot; (n, heads, size)."""
+    heads, n = query.shape[1], query.shape[2]
+    total = segment.start + n
+    keys, values = segment.slot.layer(layer)
+    groups = heads // keys.shape[0]
+    q = query.reshape(1, keys.shape[0], groups * n, -1)
+    mask = _causal_mask(pack, n, total, groups, scores.window, q)
+    o = _attend(q, keys[None, :, :total], values[None, :, :total], mask, groups, scores)
+    return o.reshape(heads, n, -1).transpose(0, 1)
+
+
+def _batch(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
+    """The single queries (heads, B, size) of many segments, each to its slot; (B, heads, size)."""
+    totals = [s.start + 1 for s in segments]
+    slots = [s.slot.layer(layer) for s in segments]
+    longest, (keys, values) = max(totals), slots[0]
+    # Zeros, not whatever memory holds: a masked weight of 0 times NaN is NaN.
+    k = keys.new_zeros(len(segments), keys.shape[0], longest, keys.shape[2])
+    v = values.new_zeros(len(segments), values.shape[0], longest, values.shape[2])
+    for batch, known in ((k, [s[0] for s in slots]), (v, [s[1] for s in slots])):
+        rows = [batch[i, :, :t] for i, t in enumerate(totals)]
+        torch._foreach_copy_(rows, [x[:, :t] for x, t in zip(known, totals, strict=True)])
+    groups = query.shape[0] // keys.shape[0]
+    q = query.transpose(0, 1).reshape(len(segments), keys.shape[0], groups, -1)
+    mask = _padding_mask(pack, totals, scores.window, q)
+    return _attend(q, k, v, mask, groups, scores).reshape(len(segments), query.shape[0], -1)
+
+
+def _causal_mask(pack: Pack, n: int, total: int, groups: int, window: int, like: torch.Tensor) -> torch.Tensor | None:
     """Additive mask (groups * n, total) of the last ``n`` of ``total`` positions; ``None`` if nothing is hidden."""
     if n == 1 and not 0 < window < total:
         return None
@@ -107,33 +173,39 @@ def _mask(pack: _Pack, n: int, total: int, groups: int, window: int, like: torch
         hidden = there > here
         if window:
             hidden |= there <= here - window
-        cached = torch.zeros(n, total, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
-        cached = pack.masks[n, total, groups, window] = cached.repeat(groups, 1)
+        mask = torch.zeros(n, total, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
+        cached = pack.masks[n, total, groups, window] = mask.repeat(groups, 1)
+    return cached
+
+
+def _padding_mask(pack: Pack, totals: Sequence[int], window: int, like: torch.Tensor) -> torch.Tensor:
+    """Additive mask (B, 1, 1, longest) of the last of each row's ``totals`` positions."""
+    cached = pack.masks.get((window,))
+    if cached is None:
+        ends = torch.tensor(totals, device=like.device)[:, None]
+        there = torch.arange(max(totals), device=like.device)[None]
+        hidden = there >= ends
+        if window:
+            hidden |= there < ends - window
+        mask = torch.zeros(hidden.shape, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
+        cached = pack.masks[(window,)] = mask[:, None, None]
     return cached
 
 
 def _attend(
-    q: torch.Tensor,
-    k: torch.Tensor,
-    v: torch.Tensor,
-    mask: torch.Tensor | None,
-    scaling: float | None,
-    softcap: float | None,
-    sinks: torch.Tensor | None,
+    q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, mask: torch.Tensor | None, groups: int, scores: _Scores
 ) -> torch.Tensor:
-    """Attention written out, for what the fused kernel lacks: soft-capped scores, and attention sinks (one per
-    head)."""
-    scores = torch.matmul(q, k.transpose(-1, -2)).float() * (q.shape[-1] ** -0.5 if scaling is None else scaling)
-    if softcap is not None:
-        scores = torch.tanh(scores / softcap) * softcap
+    """Attention of (B, key-value heads, groups * n, size) queries, written out where the fused kernel lacks
+    something."""
+    if scores.softcap is None and scores.sinks is None:
+        return scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scores.scaling)
+    weights = torch.matmul(q, k.transpose(-1, -2)).float()
+    weights = weights * (q.shape[-1] ** -0.5 if scores.scaling is None else scores.scaling)
+    if scores.softcap is not None:
+        weights = torch.tanh(weights / scores.softcap) * scores.softcap
     if mask is not None:
-        scores = scores + mask.float()
-    if sinks is not None:
-        per_query = (
-            sinks.float()
-            .reshape(1, k.shape[1], -1, 1)
-            .repeat_interleave(q.shape[2] // (sinks.numel() // k.shape[1]), dim=2)
-        )
-        scores = torch.cat([scores, per_query], dim=-1)
-    weights = scores.softmax(-1)[..., : k.shape[2]]
-    return torch.matmul(weights.to(v.dtype), v)
+        weights = weights + mask.float()
+    if scores.sinks is not None:
+        sinks = scores.sinks.float().reshape(1, -1, groups, 1).repeat_interleave(q.shape[2] // groups, dim=2)
+        weights = torch.cat([weights, sinks.expand(q.shape[0], -1, -1, -1)], dim=-1)
+    return torch.matmul(weights.softmax(-1)[..., : k.shape[2]].to(v.dtype), v)

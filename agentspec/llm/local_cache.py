@@ -62,6 +62,12 @@ class Slot:
         keys[:, start : start + key.shape[1]] = key
         values[:, start : start + key.shape[1]] = value
 
+    def layer(self, layer: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Keys and values of one layer that has written."""
+        keys, values = self.keys[layer], self.values[layer]
+        assert keys is not None and values is not None
+        return keys, values
+
     def copy_layer(self, layer: int, source: Slot, start: int, stop: int) -> None:
         """Take positions ``start ... stop - 1`` of one layer from ``source``."""
         key, value = source.keys[layer], source.values[layer]

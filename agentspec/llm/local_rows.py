@@ -229,8 +229,9 @@ def sample(rows: Sequence[FreeRow], logits: torch.Tensor) -> None:
     for i, s in enumerate(settings):
         if s.temperature > 0 and (s.top_k or s.top_p < 1):
             logprobs[i] = filter_top(logprobs[i], s.top_k, s.top_p)
-    uniforms = torch.tensor([[r.uniform()] for r in rows], dtype=torch.float64, device=logits.device)
-    cumulative = logprobs.double().exp_().cumsum_(-1)
+    exact = torch.float32 if logits.device.type == "mps" else torch.float64
+    uniforms = torch.tensor([[r.uniform()] for r in rows], dtype=exact, device=logits.device)
+    cumulative = logprobs.to(exact, copy=True).exp_().cumsum_(-1)
     picks = torch.searchsorted(cumulative, uniforms * cumulative[:, -1:], right=True).clamp_(max=logits.shape[1] - 1)
     if any(s.temperature == 0 for s in settings):
         greedy = torch.tensor([[s.temperature == 0] for s in settings], device=logits.device)

@@ -1,11 +1,10 @@
 """LATS, language agent tree search (Zhou et al., 2024): Monte-Carlo tree search in the environment itself.
 
-A node is an action and what the *real* environment answered to it: the environment is put back by a snapshot, steps are
-tried, and before the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with samples of
-the policy (equal ones merged), lets a judge value the new states (``mix`` of its rating and of the share of samples that
-proposed the action), goes on from the best one (to the end, or not at all with ``rollout="value"``), and back-propagates
-the rewards on the way plus the last state's value. A path that ends without success is reflected on in words; later
-proposals and judgements of the episode are shown the last ``max_reflections`` of these. A success ends the search.
+A node is an action and what the *real* environment answered to it: steps are tried, the environment is put back by a
+snapshot, and after the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with samples
+of the policy, lets a judge value the new states, goes on from the best one (to the end, or not at all with
+``rollout="value"``), and back-propagates the rewards on the way plus the last state's value. A path that ends without
+success is reflected on in words, and later proposals and judgements are shown these lessons. A success ends the search.
 
 Without snapshots the method is not LATS: it is refused, or, with ``world="model"``, the model predicts what would be
 observed, as in RAP, and the trace says ``world: model``.
@@ -13,6 +12,7 @@ observed, as in RAP, and the trace says ``world: model``.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,10 +29,10 @@ from agentspec.reasoning.common import (
     user_turn,
     with_request,
 )
-from agentspec.reasoning.search.judge import last_number
-from agentspec.reasoning.search.meter import Ask, Meter, OutOfBudgetError
+from agentspec.reasoning.search.judge import RATE, UNREAD, rate
+from agentspec.reasoning.search.meter import Meter, OutOfBudgetError
 from agentspec.reasoning.search.propose import legal, sample_steps
-from agentspec.reasoning.search.tree import Node, backpropagate, close, select
+from agentspec.reasoning.search.tree import Node, backpropagate, close, nodes_where, select
 from agentspec.reasoning.search.world import ModelWorld, RealWorld, World, render_steps, root_outcome
 from agentspec.registry import SpecError
 from agentspec.state import dump_state, load_state
@@ -48,17 +48,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "rl": {"num_iterations": 4, "max_depth": 3, "n_generate_sample": 3, "root_samples": 3, "rollout": "value"},
 }
-RATINGS = tuple(range(1, 11))
-UNREAD = 0.5
-"""Rating (of 0 to 1) where the judge's answer holds none."""
-
 NEXT_FREE = "Write one sentence after 'Thought:' about what matters now, then one line 'Action: NAME(arguments)'."
 NEXT_MENU = "Answer with the one action that should come next, word for word."
-RATE = (
-    "Rate how promising this course is for the task, from 1 (hopeless) to 10 (as good as done). Say why in a sentence, "
-    "then end with the number."
-)
-RATE_NUMBER = "Rate how promising this course is for the task, from 1 (hopeless) to 10 (as good as done)."
 REFLECT = (
     "This attempt is over and was not a success (return {total:g}). In one or two sentences: which step was the "
     "mistake, and what should be tried instead?"
@@ -162,8 +153,8 @@ class LanguageAgentTreeSearch:
         """
         if self.world == "environment" and self.services.simulator is None:
             raise SpecError(
-                f"reasoning 'lats' searches in the environment itself, and {task.env!r} has no snapshot() and restore(); "
-                "set `world: model` to search in the model's predictions instead, or choose another reasoning module"
+                f"reasoning 'lats' searches in the environment itself, but {task.env!r} has no snapshot() and "
+                "restore(); set `world: model` to search in predictions, or choose another reasoning module"
             )
         self._lessons = []
 
@@ -193,12 +184,10 @@ class LanguageAgentTreeSearch:
 
     async def _search(self, search: Search, root: Node) -> None:
         """Iterate; what was found when the budget runs out decides, and the trace says so."""
-        try:
+        with contextlib.suppress(OutOfBudgetError):
             for _ in range(self.iterations):
                 if root.closed or await self._iterate(search, root):
                     return
-        except OutOfBudgetError:
-            pass
 
     async def _iterate(self, search: Search, root: Node) -> bool:
         """Select, expand, evaluate, simulate, back-propagate, reflect; whether a success was found."""
@@ -280,23 +269,17 @@ class LanguageAgentTreeSearch:
 
     async def _judge(self, search: Search, children: Sequence[Node], wanted: int) -> None:
         """Value of each state that is no end: ``mix`` of the judge's rating (0 to 1) and the share of samples."""
-        open_ones = []
+        alive = [child for child in children if not child.terminal]
         for child in children:
             child.prior = child.reward
-            if not child.terminal:
-                open_ones.append(child)
-        number = bool(children) and bool(children[0].state.schema.choices) and search.meter.constrains
-        sampling: dict[str, Any] = {"n": self.evaluations, "max_tokens": self.prediction_tokens}
-        if number:
-            sampling["choices"] = tuple(str(r) for r in RATINGS)
-        form = RATE_NUMBER if number else RATE
-        asks = [Ask("value", with_request(search.base, self._request(c, form)), sampling) for c in open_ones]
-        calls = await search.meter.ask_all(asks)
-        for child, call in zip(open_ones, calls, strict=False):  # fewer ratings when the budget ended among them
-            ratings = [last_number(c.text, RATINGS) for c in call.completions]
-            search.unread += ratings.count(None)
-            rating = sum(UNREAD if r is None else r / RATINGS[-1] for r in ratings) / len(ratings)
-            child.prior += self.mix * rating + (1 - self.mix) * child.note.count / wanted
+        prompts = [with_request(search.base, self._request(child, RATE)) for child in alive]
+        sampling = {"n": self.evaluations, "max_tokens": self.prediction_tokens}
+        menu = bool(children) and bool(children[0].state.schema.choices)
+        ratings = await rate(search.meter, prompts, constrained=menu and search.meter.constrains, **sampling)
+        for child, rating in zip(alive, ratings, strict=False):  # fewer ratings when the budget ended among them
+            search.unread += rating is None
+            share = child.note.count / wanted
+            child.prior += self.mix * (UNREAD if rating is None else rating) + (1 - self.mix) * share
         search.meter.stop()
 
     def _request(self, node: Node, form: str) -> str:
@@ -330,7 +313,7 @@ class LanguageAgentTreeSearch:
         if search.unread:
             trace["unread_ratings"] = search.unread
         # A success first, then what the search came to; untried ones only if nothing was tried.
-        solved = _successes(root, self._success)
+        solved = nodes_where(root, self._success)
         tried = [c for c in children if c.visits] or children
         best = solved[0].first if solved else max(tried, key=lambda c: (c.value, c.visits), default=None)
         action = legal(best.action, input.action_schema) if best else None
@@ -353,14 +336,3 @@ class LanguageAgentTreeSearch:
 
     def restore(self, blob: bytes) -> None:
         self._lessons = load_state(blob)
-
-
-def _successes(root: Node, success: Any) -> list[Node]:
-    """Successful ends in the tree, in depth-first order."""
-    found, stack = [], [root]
-    while stack:
-        node = stack.pop()
-        if success(node):
-            found.append(node)
-        stack += reversed(node.children or [])
-    return found

@@ -37,12 +37,12 @@ PLAN = "First understand the task. Then devise a plan: a numbered list of at mos
 PLAN_PLUS = " Note the quantities that matter with their values, and work out what follows from them (times, amounts)."
 REPLAN = "The last plan {why}. {failures}Devise a better one from where things stand."
 SOLVE_FREE = (
-    "Carry out the plan. Work out in a sentence or two what sub-goal {number} ({goal}) needs now, write 'Sub-goal done' "
-    "if it is achieved already, and end with one line of the form\nAction: NAME(arguments)"
+    "Carry out the plan. Work out in a sentence or two what sub-goal {number} ({goal}) needs now, write 'Sub-goal "
+    "done' if it is achieved already, and end with one line of the form\nAction: NAME(arguments)"
 )
 THINK_MENU = (
-    "Carry out the plan. Work out in a sentence or two what sub-goal {number} ({goal}) needs now; write 'Sub-goal done' "
-    "if it is achieved already. Do not name the action yet."
+    "Carry out the plan. Work out in a sentence or two what sub-goal {number} ({goal}) needs now; write 'Sub-goal "
+    "done' if it is achieved already. Do not name the action yet."
 )
 ACT_MENU = "You are at sub-goal {number} of the plan: {goal}."
 ONE_CALL = (
@@ -190,7 +190,8 @@ class PlanAndSolve:
             call = await self.services.llm.generate("act", messages, **self.limit)
             words = call.text
             action = read_action(call.text, schema)
-        trace = {
+        goal = self._goals[self._at]
+        trace: dict[str, Any] = {
             "method": "plan_and_solve",
             "plan": self._plan,
             "sub_goal": self._at + 1,
@@ -201,7 +202,7 @@ class PlanAndSolve:
         valid = isinstance(action, Action)
         return Decision(
             action,
-            rationale=words or self._goals[trace["sub_goal"] - 1],
+            rationale=words or goal,
             calls=(*calls, (call.id, 0)),
             valid=valid,
             turn=(sampled(call),),

@@ -12,6 +12,7 @@ samples instead. Nothing is executed while it searches: all states but the root'
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -186,7 +187,8 @@ class ReasoningViaPlanning(Stateless):
         problem = ImaginedProblem(self, meter, base, input.action_schema)
         root = Node(state=root_outcome(input, None))
         record: list[tuple[float, list[Node]]] = []
-        try:
+        # Out of budget: what was found until then decides, and the trace says so.
+        with contextlib.suppress(OutOfBudgetError):
             await mcts.search(
                 root,
                 problem,
@@ -195,8 +197,6 @@ class ReasoningViaPlanning(Stateless):
                 weight=self.exploration,
                 record=record,
             )
-        except OutOfBudgetError:
-            pass  # what was found until then decides, and the trace says so
         trace: dict[str, Any] = {"method": "rap", "world": "model", "iterations": len(record)}
         leaf = self._output(root, record)
         action = legal(leaf.first.action, input.action_schema) if leaf else None

@@ -1,8 +1,8 @@
 """Self-Consistency (Wang et al., 2023): independent chains of thought, and a majority vote over their actions.
 
-The chains are samples of one prompt at a temperature above 0. What is counted are *canonical* actions, however they were
-written; an answer without a legal action has no vote; of equally frequent actions the one that came first wins. In menu
-mode every chain is followed by its own constrained choice, in a prompt that holds that chain alone.
+The chains are samples of one prompt at a temperature above 0. What is counted are *canonical* actions, however they
+were written; an answer without a legal action has no vote; of equally frequent actions the one that came first wins. In
+menu mode every chain is followed by its own constrained choice, in a prompt that holds that chain alone.
 """
 
 from __future__ import annotations

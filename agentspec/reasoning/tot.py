@@ -12,6 +12,7 @@ menu is unknown, and they are short free lines that are never executed.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -156,10 +157,8 @@ class TreeOfThoughts(Stateless):
         search = Search(base, input.action_schema, Meter(self.services.llm, **self.limits))
         root = Node()
         # Out of budget: what was found until then decides, and the trace says so.
-        try:
+        with contextlib.suppress(OutOfBudgetError):
             await (self._breadth_first(search, root) if self.strategy == "BFS" else self._depth_first(search, root))
-        except OutOfBudgetError:
-            pass
         trace: dict[str, Any] = {"method": "tot", "layers": [len(layer) for layer in search.layers]}
         if search.unread:
             trace["unread_judgements"] = search.unread
@@ -190,7 +189,7 @@ class TreeOfThoughts(Stateless):
         """The nodes kept: the ``breadth`` best, or as many drawn in proportion to their values without repetition."""
         if self.greedy:
             return sorted(candidates, key=lambda n: -n.prior)[: self.breadth]
-        left, kept = list(candidates), []
+        left, kept = list(candidates), list[Node]()
         while left and len(kept) < self.breadth:
             weights = [node.prior + 1e-9 for node in left]
             kept.append(left.pop(self.services.rng.choices(range(len(left)), weights)[0]))

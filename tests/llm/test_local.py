@@ -370,6 +370,19 @@ def test_architectures(name):
         assert close(call.completions[0].logprobs, recomputed(llm, call))
 
 
+@pytest.mark.parametrize("name", ["llama", "gemma2", "mistral", "gpt_oss"])
+def test_writing_rows_as_one_padded_batch(name, monkeypatch):
+    # What an accelerator does; the CPU takes rows one by one.
+    torch.manual_seed(0)
+    model = _architectures()[name]().eval()
+    expected = converse_all(LocalLLM(model, tiny_tokenizer(), name=name), ["a", "bbb", "cccccc"])
+    monkeypatch.setattr("agentspec.llm.local_attention._BATCHED_FROM", {"cpu": 2})
+    got = converse_all(LocalLLM(model, tiny_tokenizer(), name=name), ["a", "bbb", "cccccc"])
+    for x, y in zip(got, expected, strict=True):
+        assert [c.completions[0].token_ids for c in x] == [c.completions[0].token_ids for c in y]
+        assert all(close(a.completions[0].logprobs, b.completions[0].logprobs) for a, b in zip(x, y, strict=True))
+
+
 def test_architectures_that_do_not_fit_are_refused():
     import transformers as t
 
@@ -380,7 +393,7 @@ def test_architectures_that_do_not_fit_are_refused():
 
 def test_a_wrong_forward_is_noticed_before_it_is_used(monkeypatch):
     llm = tiny()
-    monkeypatch.setattr("agentspec.llm.local_forward._mask", lambda *a: None)
+    monkeypatch.setattr("agentspec.llm.local_attention._causal_mask", lambda *a: None)
     with pytest.raises(LLMError, match="does not compute Qwen3ForCausalLM"):
         ask(llm)
 

@@ -105,7 +105,7 @@ def ours(tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any
         processing_class=tokenizer,
         make_llm=lambda model, tokenizer: object.__new__(type("Unused", (LLM,), {})),
     )
-    monkeypatch.setattr(grpo_module, "collect", lambda runner, jobs: episodes)
+    monkeypatch.setattr(grpo_module, "collect", lambda runner, jobs, **_: episodes)
     return spied(trainer)
 
 

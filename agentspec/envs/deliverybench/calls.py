@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from agentspec.envs.deliverybench.food import COLD, FROZEN, HOT, MENU, Food
+from agentspec.envs.deliverybench.food import MENU, Food
 from agentspec.envs.deliverybench.notes import CALL, HAND, KNOCK, LEAVE, NOTES
+from agentspec.envs.deliverybench.packing import HOME
 
 View = Mapping[str, Any]
 Card = Mapping[str, Any]
@@ -23,8 +24,7 @@ FOODS: Mapping[str, Food] = {food.name: food for food in MENU}
 METHODS_OF: Mapping[str, tuple[str, ...]] = dict(NOTES)
 MANNER: Mapping[str, str] = {LEAVE: "at the door", KNOCK: "by knocking", CALL: "by calling", HAND: "by hand"}
 
-# Compartments by kind of food; smelly food goes to the last one of its kind that is free of others.
-_HOME = {HOT: "A", COLD: "B", FROZEN: "C"}
+# Weights of a dish's misfit in a compartment: neighbours of another smell or temperature, and cold walls.
 _SMELL_PENALTY = 25.0
 _DEGREE_PENALTY = 1.0
 _EMPTY_PENALTY = 8.0
@@ -38,6 +38,11 @@ def distance(a: Sequence[float], b: Sequence[float]) -> float:
 def within_reach(view: View, xy: Sequence[float]) -> bool:
     """Whether the courier stands within reach of a point, with 5 cm to spare for rounding."""
     return distance(view["position"], xy) <= REACH_M - 0.05
+
+
+def hands_full(view: View) -> bool:
+    """Whether picked-up food is not in the bag yet."""
+    return any(order["hand"] for order in view["orders"])
 
 
 def move(xy: Sequence[float], pace: str = "normal") -> str:
@@ -108,7 +113,7 @@ def bag(view: View, orders: Sequence[Card]) -> str:
 def _misfit(label: str, contents: Sequence[Food], food: Food) -> float:
     """How badly a dish fits into a compartment: degrees to its neighbours, smell, and cold walls of an empty one."""
     if not contents:
-        return _EMPTY_PENALTY + (0.0 if _HOME.get(food.category, "D") == label else 1.0)
+        return _EMPTY_PENALTY + (0.0 if HOME.get(food.category, "D") == label else 1.0)
     degrees = max(abs(food.serving - other.serving) for other in contents)
     smell = any(food.smells != other.smells for other in contents)
     return _DEGREE_PENALTY * degrees + (_SMELL_PENALTY if smell else 0.0)

@@ -28,14 +28,17 @@ from agentspec.envs.deliverybench.view import IN_BAG, IN_HAND, READY
 
 MEMO_LIMIT = 100_000
 CHARGING_PAYS_S = 600.0
+PAUSE_S = 10.0
 REST_OF_SHIFT = "WAIT({:.1f})"
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a courier values things: dollars per second, per metre and per action, and what a new order must add.
+    """How a courier values things: dollars per second, per metre and per action (where actions are limited), and what a
+    new order must add.
 
-    `hasty` moves at the accelerated pace while nothing fragile is carried; `bagging` packs food into the bag.
+    `hasty` moves at the accelerated pace while nothing fragile is carried; `bagging` packs food into the bag (without
+    it, food is carried in the hand, and under fair rules on foot).
     """
 
     second: float = 0.07
@@ -61,35 +64,42 @@ class RuleBasedCourier:
         self.city = city
         self.style = style or Style()
         self.round: list[Stop] = []
+        self._last = ""
         self._memo: tuple[dict[tuple[Point, Point], float], dict[tuple[Point, Point], float]] = ({}, {})
 
     # -- the interface -----------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Forget the round; call at the start of an episode."""
-        self.round = []
+        self.round, self._last = [], ""
 
     def act(self, info: Mapping[str, Any]) -> str:
         """The next action for `info` of reset or step: one of the menu's texts if there is a menu, else a call."""
         view = info["state"]
         if info["action_schema"].choices:
             return self.choose(view).text
-        return self.call(view)
+        action = self.call(view)
+        if action == self._last and view["error"]:
+            # What has just been refused is not tried again at once.
+            action = calls.wait(PAUSE_S)
+        self._last = action
+        return action
 
     def snapshot(self) -> bytes:
-        """The round, for `restore`."""
-        return json.dumps([[s.job, s.kind, list(s.place)] for s in self.round]).encode()
+        """The round and the last action, for `restore`."""
+        return json.dumps([self._last, [[s.job, s.kind, list(s.place)] for s in self.round]]).encode()
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`."""
-        self.round = [Stop(job, kind, (place[0], place[1])) for job, kind, place in json.loads(blob)]
+        self._last, stops = json.loads(blob)
+        self.round = [Stop(job, kind, (place[0], place[1])) for job, kind, place in stops]
 
     # -- native actions ----------------------------------------------------------------------------------------
 
     def call(self, view: View) -> str:
         """The next native call."""
         style = self.style
-        action = self._at_hand(view) or errands.refresh(view, style.upkeep) or errands.regain(view)
+        action = self._at_hand(view) or errands.refresh(view, style.upkeep) or self._mount(view)
         if action is not None:
             return action
         car = errands.wants_car(view, style.upkeep)
@@ -114,6 +124,12 @@ class RuleBasedCourier:
             return calls.bag(view, hand)
         ready = [o["id"] for o in orders if o["status"] == READY and within_reach(view, o["pickup_xy"])]
         return calls.pick_up(ready) if ready else None
+
+    def _mount(self, view: View) -> str | None:
+        """Get on a vehicle, or off it where food in the hand has to be carried on foot."""
+        if view["hands_must_be_free"] and calls.hands_full(view):
+            return None if view["mode"] == "walk" else 'SWITCH(to="walk")'
+        return errands.regain(view)
 
     def _take(self, view: View, planner: Planner, start: Point) -> list[int]:
         room = min(self.style.max_orders - len(view["orders"]), 99 if view["room"] is None else view["room"])
@@ -177,7 +193,7 @@ class RuleBasedCourier:
             second=style.second,
             idle=style.idle,
             metre=metre,
-            call=style.call,
+            call=0.0 if view["calls_left"] is None else style.call,
             delay=delay,
             horizon=view["left_s"] - 5.0,
             actions=math.inf if view["calls_left"] is None else view["calls_left"],

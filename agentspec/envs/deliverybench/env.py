@@ -170,7 +170,9 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         choices = tuple(self._menu)
         schema = replace(world.schema, choices=choices) if choices else world.schema
         if self.compact:
-            text = compact_text(view, last.error or last.message, choices)
+            # The menu shows what a success led to; only failures and payments need words.
+            said = last.error or (last.message if not choices or "delivered" in last.events else "")
+            text = compact_text(view, said, choices)
         else:
             text = full_text(view, surroundings(self.city, view))
             if choices:
@@ -255,6 +257,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "net_earnings": earned,
             "deliveries": len(world.state.settlements),
             "clock_s": view["clock_s"],
+            "hourly_profit": earned / self.shift_hours,
         }
         info: dict[str, Any] = {
             "instruction": self.instruction,

@@ -53,11 +53,15 @@ def best_offers(view: View, count: int = MAX_OFFERS) -> list[Card]:
 
 def options(view: View) -> list[Option]:
     """The menu for this view, at most `MAX_CHOICES` options in a stable order: work first, then offers, then care."""
-    found = [option for order in view["orders"][: MAX_ORDERS + 1] for option in _work(view, order)]
+    # Food in the hand comes first, and is packed before the courier goes on: no vehicle moves with it (fair rules).
+    orders = sorted(view["orders"], key=lambda order: not order["hand"])
+    found = [option for order in orders[: MAX_ORDERS + 1] for option in _work(view, order)]
     room = MAX_ORDERS - len(view["orders"])
     if room > 0 and view["room"] != 0:
         found += [accept_option(offer["id"]) for offer in best_offers(view)]
     found += _vehicle(view) + _energy(view)
+    if calls.hands_full(view):
+        found = [option for option in found if not option.call.startswith("MOVE")]
     found = found[: MAX_CHOICES - 1]
     found.append(Option("wait 1 minute", calls.wait(SHORT_WAIT_S)))
     return list({option.text: option for option in found}.values())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from agentspec.envs.deliverybench.clock import blocked, go_to_hospital, interruption, pass_time
 from agentspec.envs.deliverybench.grammar import MAX_COORDINATE, MAX_INTEGER, Refused, argument, number, short, unread
+from agentspec.envs.deliverybench.packing import suggestion
 from agentspec.envs.deliverybench.state import Point
 from agentspec.envs.deliverybench.transport import Follower, heading, ticks_until_empty, waypoints_of
 from agentspec.types import Action
@@ -35,6 +36,7 @@ def move(world: World, action: Action) -> str:
     place = f"({target[0] / 100:.2f}m, {target[1] / 100:.2f}m)"
     if math.dist(state.position, target) <= rules.nearby:
         return f"moved to {place}, already there"
+    _free_hands(world)
     state.pace = pace if pace in rules.pace else "normal"
     if state.pace == "accel":
         world.shake_food()
@@ -51,6 +53,21 @@ def _target(action: Action, bare_cm: bool) -> Point:
         far = MAX_COORDINATE / 100.0
         raise unread(action, f"({x / 100:.0f}m, {y / 100:.0f}m) lies outside the world (at most {far:.0f}m from 0)")
     return (round(x, 4), round(y, 4))
+
+
+def _free_hands(world: World) -> None:
+    """Refuse to ride, drive or drag with food in the hand, unless the rules let it pass."""
+    state = world.state
+    if world.rules.ride_with_food_in_hand or state.mode == "walk":
+        return
+    full = [order for order in state.orders.values() if order.pending]
+    if full:
+        numbers = ", ".join(str(order.offer.id) for order in full)
+        raise Refused(
+            "MV_FOOD_IN_HAND",
+            f"you hold the food of order {numbers} in your hands: bag it first, for example "
+            f"PLACE_FOOD_IN_BAG(bag_cmd={suggestion(full)!r}), or go on foot",
+        )
 
 
 def _travel(world: World, target: Point) -> float:
@@ -143,6 +160,7 @@ def charge_way(world: World, metres: float, *, emptied: bool = False) -> tuple[b
 def step_forward(world: World, action: Action) -> str:
     """STEP_FORWARD(): one metre along the heading."""
     state, rules = world.state, world.rules
+    _free_hands(world)
     if not rules.free_last_metres:
         pass_time(world, state.tick + max(1, math.ceil(rules.step_length / world.step_length() - 1e-9)))
     yaw = math.radians(state.yaw)

@@ -25,6 +25,7 @@ View = Mapping[str, Any]
 Card = Mapping[str, Any]
 
 COMPACT_ORDERS = 4
+LOW_ENERGY = 40.0
 COMPACT_CHARS = 700
 NOTE_CHARS = 60
 MODE_WORDS = {"walk": "on foot", "drag_scooter": "dragging the scooter", "car": "in the rented car"}
@@ -227,22 +228,43 @@ def compact_text(view: View, message: str, choices: Sequence[str]) -> str:
 
     At most about `COMPACT_CHARS` characters; with `choices` the listing of the menu is part of it.
     """
+    if choices:
+        return _menu_text(view, message, choices)
     lines = [_compact_courier(view)]
-    lines += [_compact_order(order, not choices) for order in view["orders"][:COMPACT_ORDERS]]
+    lines += [_compact_order(order, True) for order in view["orders"][:COMPACT_ORDERS]]
     hidden = len(view["orders"]) - COMPACT_ORDERS
     if hidden > 0:
         lines.append(f"and {hidden} more orders")
-    shown = best_offers(view)
-    if choices:
-        shown = [offer for offer in shown if f"accept order {offer['id']}" in choices]
-    lines += [_compact_offer(offer, not choices) for offer in shown]
-    if not choices:
-        lines += _compact_care(view)
+    lines += [_compact_offer(offer) for offer in best_offers(view)]
+    lines += _compact_care(view)
     if message:
         lines.append(f"last: {_cut(message, 90)}")
-    if choices:
-        lines.append("choices: " + "; ".join(choices))
     return "\n".join(lines)
+
+
+def _menu_text(view: View, message: str, choices: Sequence[str]) -> str:
+    """The compact text of menu mode: as few tokens as the choice needs; an offer's terms stand beside its choice."""
+    place = f", at {view['place']}" if view["place"] else ""
+    lines = [
+        f"{_minutes(view['left_s'])} min left{place}, {SHORT_MODE.get(view['mode'], view['mode'])}, "
+        f"battery {view['battery']:.0f}%, earned ${view['net_earnings']:.1f}"
+    ]
+    if view["energy"] <= LOW_ENERGY:
+        lines[0] += f", energy {view['energy']:.0f}%"
+    if view["charging"] is not None:
+        lines[0] += f", charging {_minutes(view['charging']['left_s'])} min more"
+    lines += [_compact_order(order, False) for order in view["orders"][:COMPACT_ORDERS]]
+    if message:
+        lines.append(f"last: {_cut(message, 90)}")
+    terms = {f"accept order {o['id']}": _terms(o) for o in view["offers"]}
+    lines.append("choices: " + "; ".join(choice + terms.get(choice, "") for choice in choices))
+    return "\n".join(lines)
+
+
+def _terms(offer: Card) -> str:
+    """Pay, way to the restaurant plus way to the customer, and the time allowed."""
+    way = f"{offer['to_pickup_m']:.0f}m + {offer['distance_m']:.0f}m"
+    return f" (${offer['pay']:.1f}, {way}, {_minutes(offer['limit_s'])} min)"
 
 
 def _compact_courier(view: View) -> str:
@@ -267,7 +289,8 @@ def _compact_order(order: Card, native: bool) -> str:
         (calls.handover(order)[1], order["to_dropoff_m"]) if picked else (order["pickup_xy"], order["to_pickup_m"])
     )
     where = f" {_at(xy)}" if native else ""
-    text = f"order {order['id']}: {status}, {goal}{where} {way}m, {left} min, ${order['pay']:.2f}"
+    pay = f"${order['pay']:.2f}" if native else f"${order['pay']:.1f}"
+    text = f"order {order['id']}: {status}, {goal}{where} {way}m, {left} min, {pay}"
     if native and order["status"] == IN_HAND:
         text += f", in hand: {', '.join(order['hand'])}"
     if native and picked and order["note"]:
@@ -275,11 +298,10 @@ def _compact_order(order: Card, native: bool) -> str:
     return text
 
 
-def _compact_offer(offer: Card, native: bool) -> str:
-    where = f" at {_at(offer['pickup_xy'])}" if native else ""
+def _compact_offer(offer: Card) -> str:
     return (
-        f"offer {offer['id']}: ${offer['pay']:.2f}, {offer['pickup']}{where} {offer['to_pickup_m']}m, then "
-        f"{offer['distance_m']}m, {_minutes(offer['limit_s'])} min"
+        f"offer {offer['id']}: ${offer['pay']:.2f}, {offer['pickup']} at {_at(offer['pickup_xy'])} "
+        f"{offer['to_pickup_m']}m, then {offer['distance_m']}m, {_minutes(offer['limit_s'])} min"
     )
 
 

@@ -12,9 +12,11 @@ clause, once, and anything unreadable is an error.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from agentspec.envs.deliverybench.bag import LABELS, Bag, Item
+from agentspec.envs.deliverybench.food import COLD, FROZEN, HOT
 from agentspec.envs.deliverybench.grammar import Refused, short
 from agentspec.envs.deliverybench.state import OrderState
 
@@ -22,6 +24,23 @@ _BLOCK = re.compile(r"order\s+(\d{1,12})\s*:", re.IGNORECASE)
 _NUMBER = re.compile(r"(?<![\w.])(?<![A-Za-z]\.)([1-9]\d{0,11})(?![\w.])")
 _REF = re.compile(r"\s*([^\s.]*)\s*\.\s*(\S*)\s*")
 _EXAMPLE = 'write for example "order 3: 1,2 -> A; 3 -> B"'
+
+
+HOME = {HOT: "A", COLD: "B", FROZEN: "C"}
+"""A compartment for each kind of food; the rest goes to D."""
+
+
+def suggestion(orders: Iterable[OrderState]) -> str:
+    """A command that puts all food in the hand of ``orders`` into the bag, hot, cold and frozen food apart."""
+    blocks = []
+    for order in orders:
+        by_label: dict[str, list[str]] = {}
+        for number, item in enumerate(order.pending, start=1):
+            label = "D" if item.food is None else HOME.get(item.food.category, "D")
+            by_label.setdefault(label, []).append(str(number))
+        clauses = "; ".join(f"{','.join(numbers)} -> {label}" for label, numbers in sorted(by_label.items()))
+        blocks.append(f"order {order.offer.id}: {clauses}")
+    return " ".join(blocks)
 
 
 @dataclass

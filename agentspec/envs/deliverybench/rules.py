@@ -105,6 +105,7 @@ class Rules:
 
     # Quirks of the original logic (True = present)
     hand_food_is_inert: bool = quirk("Food in the hand keeps its temperature and is never damaged: never bag anything.")
+    ride_with_food_in_hand: bool = quirk("MOVE and STEP_FORWARD on a vehicle work with unbagged food in the hand.")
     placing_freezes_food: bool = quirk("Each bag command freezes the graded state of all food bagged before it.")
     ride_parked_scooter: bool = quirk("A refused SWITCH parks the vehicle but the courier goes on riding it.")
     rest_above_full: bool = quirk("REST accepts targets above 100 % energy.")
@@ -179,7 +180,7 @@ def quirks() -> dict[str, str]:
 
 ORIGINAL = Rules()
 _QUIRKS_OFF: dict[str, Any] = dict.fromkeys(quirks(), False)
-FAIR = replace(ORIGINAL, name="fair", max_active_orders=10, **_QUIRKS_OFF)
+FAIR = replace(ORIGINAL, name="fair", max_calls=None, max_active_orders=10, **_QUIRKS_OFF)
 RULE_SETS: Mapping[str, Rules] = {"original": ORIGINAL, "fair": FAIR}
 
 

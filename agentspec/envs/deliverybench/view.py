@@ -76,6 +76,7 @@ def describe(world: World, cards: OfferCards) -> dict[str, Any]:
         "orders": [_order(world, order, cards, field) for order in state.orders.values()],
         "offers": [_offer(cards[number], cards.book[number], field) for number in state.pool],
         "room": None if rules.max_active_orders is None else max(0, rules.max_active_orders - len(state.orders)),
+        "hands_must_be_free": not rules.ride_with_food_in_hand,
         "bag": _bag(state),
         "nearest": _nearest(world, field),
         "bus": _bus(world.timetable.phase(state.tick), clock),

@@ -1,9 +1,21 @@
-"""Reading a judge's verdict: one of a few words, or a number."""
+"""Judges: reading a verdict (one of a few words, or a number), and rating states."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+from agentspec.llm.base import Message
+from agentspec.reasoning.common import with_request
+from agentspec.reasoning.search.meter import Ask, Meter
+
+RATINGS = tuple(range(1, 11))
+UNREAD = 0.5
+"""Rating (of 0 to 1) to assume where the judge's answer holds none."""
+
+RATE = "Rate how promising this course is for the task, from 1 (hopeless) to 10 (as good as done)."
+IN_WORDS = "Say why in a sentence, then end with the number."
 
 _INTEGER = re.compile(r"(?<![\d.])\d+(?![\d.]*\d)")
 
@@ -20,3 +32,21 @@ def last_number(text: str, allowed: Sequence[int]) -> int | None:
     found = [int(m) for m in _INTEGER.findall(text[:10_000]) if len(m) < 10]
     fitting = [n for n in found if n in allowed]
     return fitting[-1] if fitting else None
+
+
+async def rate(
+    meter: Meter, prompts: Sequence[Sequence[Message]], *, constrained: bool, **sampling: Any
+) -> list[float | None]:
+    """Mean rating (0 to 1) of each prompt that ends with :data:`RATE`; ``None`` where no answer holds a number.
+
+    Fewer come back when the budget ends among them: the first ones.
+    """
+    if constrained:
+        sampling["choices"] = tuple(str(r) for r in RATINGS)
+    else:
+        prompts = [with_request(messages, IN_WORDS) for messages in prompts]
+    ratings: list[float | None] = []
+    for call in await meter.ask_all([Ask("value", messages, sampling) for messages in prompts]):
+        found = [n for n in (last_number(c.text, RATINGS) for c in call.completions) if n is not None]
+        ratings.append(sum(found) / len(found) / RATINGS[-1] if found else None)
+    return ratings

@@ -1,8 +1,8 @@
 """Monte-Carlo tree search as RAP does it (Hao et al., 2023; verified against the authors' llm-reasoners 1.0.2).
 
-Select by UCT; expand the leaf: the world model gives its state, then its actions get fast rewards; simulate by following
-the greatest fast reward, expanding on the way; back-propagate the sum of rewards from each node to the end. States are
-lazy: the world model is asked once per edge, when the edge is first visited.
+Select by UCT; expand the leaf: the world model gives its state, then its actions get fast rewards; simulate by
+following the greatest fast reward, expanding on the way; back-propagate the sum of rewards from each node to the end.
+States are lazy: the world model is asked once per edge, when the edge is first visited.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ A node stands for an action taken in its parent's state. Its state is filled in 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -123,6 +123,17 @@ def close(node: Node) -> None:
     while node.parent is not None and all(c.closed for c in node.parent.children or ()):
         node = node.parent
         node.closed = True
+
+
+def nodes_where(root: Node, holds: Callable[[Node], bool]) -> list[Node]:
+    """The nodes for which ``holds`` is true, depth first, children in their order."""
+    found, stack = [], [root]
+    while stack:
+        node = stack.pop()
+        if holds(node):
+            found.append(node)
+        stack += reversed(node.children or [])
+    return found
 
 
 def best_leaf(root: Node, depth: int) -> tuple[float, Node] | None:

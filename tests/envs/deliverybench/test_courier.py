@@ -9,7 +9,7 @@ from statistics import mean
 import pytest
 
 from agentspec.envs.deliverybench import errands
-from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier
+from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier, Style
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.errands import Upkeep
 from agentspec.envs.deliverybench.planning import DROPOFF, PICKUP, Job, Planner, Stop, payment
@@ -155,6 +155,28 @@ def test_as_reasoners_without_a_model(style: str, options: dict) -> None:
     assert first.status == "completed", first.error
     assert [t.action_text for t in first.transitions] == [t.action_text for t in again.transitions]
     assert first.metrics["llm_calls"] == 0 and all(t.decision.valid for t in first.transitions)
+
+
+def test_bagging_pays_under_fair_rules() -> None:
+    env = DeliveryBenchEnv(size="tiny")
+    earned = {}
+    for bagging in (True, False):
+        courier, ended = RuleBasedCourier(env.city, Style(bagging=bagging)), False
+        _, info = env.reset(seed=0)
+        while not ended:
+            _, _, terminated, truncated, info = env.step(courier.act(info))
+            ended = terminated or truncated
+        earned[bagging] = info["net_earnings"]
+    assert earned[True] > 100.0 and earned[True] > 2.0 * earned[False]
+
+
+def test_a_refused_action_is_not_repeated_at_once() -> None:
+    env = DeliveryBenchEnv(size="tiny")
+    _, info = env.reset(seed=0)
+    courier = RuleBasedCourier(env.city)
+    action = courier.act(info)
+    state = {**info["state"], "error": "no"}
+    assert courier.act({**info, "state": state}) == "WAIT(10)" != action
 
 
 def test_courier_state_survives_a_snapshot() -> None:

@@ -76,14 +76,29 @@ def test_max_steps_truncates() -> None:
     assert truncated and not terminated and "report" in info and info["state"]["calls_left"] == 0
 
 
-def test_the_rules_limit_of_actions_truncates() -> None:
-    env = tiny()
+def test_original_rules_end_after_200_actions_and_fair_ones_do_not() -> None:
+    env = tiny(rules="original")
     env.reset(seed=0)
     for _ in range(200):
         _, _, terminated, truncated, info = env.step("VIEW_ORDERS()")
     assert truncated and not terminated
+    fair = tiny()
+    assert fair.reset(seed=0)[1]["state"]["calls_left"] is None
+    assert not any(fair.step("VIEW_ORDERS()")[3] for _ in range(300))
     _, reward, _, truncated, info = env.step("WAIT(5)")
     assert reward == 0.0 and truncated and info["error_code"] == "ENDED"
+
+
+def test_hourly_profit_is_told_at_every_step() -> None:
+    env = tiny(shift_hours=0.5)
+    courier, ended = RuleBasedCourier(env.city), False
+    _, info = env.reset(seed=1)
+    assert info["metrics"]["hourly_profit"] == 0.0
+    while not ended:
+        _, _, terminated, truncated, info = env.step(courier.act(info))
+        ended = terminated or truncated
+        # Dollars in half an hour, times two.
+        assert info["metrics"]["hourly_profit"] == pytest.approx(2.0 * info["net_earnings"])
 
 
 def test_same_seed_same_episode_and_the_stream_continues() -> None:

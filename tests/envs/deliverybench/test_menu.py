@@ -111,6 +111,19 @@ def test_bag_command_keeps_hot_and_cold_apart_and_smelly_food_alone() -> None:
     assert calls.bag({"bag": bag}, [order]) == 'PLACE_FOOD_IN_BAG(bag_cmd="order 3: 1,3 -> A; 2 -> B; 4 -> C; 5 -> D")'
 
 
+def test_food_in_the_hand_is_bagged_before_anything_moves() -> None:
+    env = DeliveryBenchEnv(size="tiny", action_mode="menu")
+    _, info = env.reset(seed=0)
+    while not any(order["hand"] for order in info["state"]["orders"]):
+        texts = info["action_schema"].choices
+        wanted = [t for t in texts if t.startswith(("pick up", "wait for", "go to pickup"))]
+        *_, info = env.step((wanted or texts)[0])
+    choices = info["action_schema"].choices
+    assert choices[0].startswith("bag order") and not any(c.startswith("go to") for c in choices)
+    *_, info = env.step(choices[0])
+    assert not info["invalid"] and any(c.startswith("go to drop-off") for c in info["action_schema"].choices)
+
+
 def test_handover_follows_the_note() -> None:
     card = {"id": 1, "dropoff_xy": [1.0, 2.0], "handoff_xy": [5.0, 6.0], "note": ""}
     assert calls.handover(card) == ("leave_at_door", [1.0, 2.0])

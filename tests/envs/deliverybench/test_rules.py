@@ -10,7 +10,8 @@ from itertools import pairwise
 import pytest
 
 from agentspec.envs.deliverybench.bag import Item
-from agentspec.envs.deliverybench.food import MENU
+from agentspec.envs.deliverybench.food import COLD, HOT, MENU
+from agentspec.envs.deliverybench.packing import suggestion
 from agentspec.envs.deliverybench.rules import FAIR, ORIGINAL, quirk_table, quirks, rules_named
 from agentspec.envs.deliverybench.world import World
 from tests.envs.deliverybench.helpers import (
@@ -32,7 +33,7 @@ BOTH = ("original", "fair")
 def test_rule_sets() -> None:
     names = list(quirks())
     assert all(getattr(ORIGINAL, name) for name in names) and not any(getattr(FAIR, name) for name in names)
-    assert replace(FAIR, name="original", max_active_orders=None, **dict.fromkeys(names, True)) == ORIGINAL
+    assert replace(FAIR, name="original", max_calls=200, max_active_orders=None, **dict.fromkeys(names, True)) == ORIGINAL
     assert rules_named("fair") is FAIR and rules_named(ORIGINAL) is ORIGINAL
     with pytest.raises(ValueError, match="unknown rule set 'cosy'"):
         rules_named("cosy")
@@ -97,6 +98,36 @@ def test_hand_food_is_shaken_in_fair() -> None:
         store = tiny().pois_of("hospital")[0].anchor
         w.step(f'MOVE({metres(store)}, pace="accel")')
         assert max(item.damage for item in w.state.orders[number].items) == damage
+
+
+def test_quirk_ride_with_food_in_hand() -> None:
+    for rules in BOTH:
+        w = world(rules)
+        collect(w, 0)
+        target = metres(off(w.state.position, 0.0, 20_000.0))
+        if rules == "original":
+            do(w, f"MOVE({target})")
+            do(w, "STEP_FORWARD()")
+            continue
+        message = refuse(w, f"MOVE({target})", "MV_FOOD_IN_HAND").message
+        refuse(w, "STEP_FORWARD()", "MV_FOOD_IN_HAND")
+        # On foot it may be carried, and the command that the refusal suggests frees the hands.
+        do(w, 'SWITCH("walk")')
+        do(w, "STEP_FORWARD()")
+        do(w, 'SWITCH("e-scooter")')
+        do(w, message[message.index("PLACE") : message.index(", or go")])
+        do(w, f"MOVE({target})")
+
+
+def test_suggested_bag_command_keeps_hot_and_cold_apart() -> None:
+    w = world("fair")
+    number = next(n for n in range(200) if {food.category for food in w.book[n].foods} >= {HOT, COLD})
+    w.state.pool[0] = number
+    collect(w, number)
+    do(w, f"PLACE_FOOD_IN_BAG(bag_cmd={suggestion(w.state.orders.values())!r})")
+    for label, category in (("A", HOT), ("B", COLD)):
+        items = w.state.bag.compartments[label].items
+        assert items and all(item.food is not None and item.food.category == category for item in items)
 
 
 def test_quirk_placing_freezes_food() -> None:

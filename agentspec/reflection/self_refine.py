@@ -1,0 +1,192 @@
+"""Self-Refine (Madaan et al., 2023): feedback on a first answer, another answer, and again, until the critic is content.
+
+One model plays two roles in separate calls. The critic sees the situation and the candidate action before it is executed
+and says what is wrong with it; the refiner answers anew. Both are shown the whole history of attempts and feedback. It
+ends when the critic keeps the action, when a refinement changes nothing, or after ``max_iterations``. A refinement that
+is no legal action is ignored: the action stands, and the history says so. An illegal first action is shown to the critic
+with its error, so the method repairs what a reasoner could not parse.
+
+When an action is replaced its calls are credited as explored and the refining call as executed; a plan that goes on to
+guide later steps keeps its credit.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from agentspec.llm.base import Message, system, user
+from agentspec.llm.recorder import BudgetExceededError
+from agentspec.protocols import Services
+from agentspec.reasoning.common import (
+    CALL_ANSWER,
+    MENU_ANSWER,
+    ON_REQUEST,
+    at_least,
+    canonical,
+    clip,
+    read_action,
+    settings,
+    static_prompt,
+    user_turn,
+)
+from agentspec.trajectory import Trajectory
+from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task
+
+PRESETS = {"paper": {"max_iterations": 3}, "rl": {"max_iterations": 1}}
+
+ATTEMPT = "Attempt {number}: {action}"
+FEEDBACK_ON = "Feedback on attempt {number}: {feedback}"
+ASK_FEEDBACK = (
+    "The latest attempt has not been carried out yet. Judge it as a strict critic: is it possible now, does it serve "
+    "the task, is there something clearly better? Name concrete changes in one to three sentences. Then write a last "
+    "line 'Verdict: keep' if it should be carried out as it is, otherwise 'Verdict: change'."
+)
+ASK_REFINED = "Take all of the feedback into account and give a better attempt. {how}"
+
+_VERDICT = re.compile(r"\bverdict\W{0,6}(keep|change)\b", re.IGNORECASE)
+
+
+@dataclass
+class Draft:
+    """One revision under way: the situation, the history, the decision as it stands, and the refinements tried."""
+
+    input: AgentInput
+    situation: str
+    decision: Decision
+    history: list[str] = field(default_factory=list)
+    attempts: int = 0
+    tried: list[LLMCall] = field(default_factory=list)
+    stopped: str = "max_iterations"
+
+    def attempt(self, text: str) -> None:
+        """Add an attempt to the history."""
+        self.attempts += 1
+        self.history.append(ATTEMPT.format(number=self.attempts, action=text))
+
+
+class SelfRefine:
+    """Feedback and refinement of every decision.
+
+    Args:
+        preset: ``paper`` (at most 3 iterations, as AgentSpec) or ``rl`` (1).
+        max_iterations: most pairs of feedback and refinement.
+        feedback_tokens: most tokens of a feedback.
+        history_tokens: budget of attempts and feedback in a prompt; the oldest go first.
+        memory_tokens: budget of what memory adds to a prompt.
+    """
+
+    def __init__(
+        self,
+        services: Services,
+        preset: str = "paper",
+        max_iterations: int | None = None,
+        feedback_tokens: int = 96,
+        history_tokens: int = 512,
+        memory_tokens: int = 256,
+    ) -> None:
+        chosen = settings("self_refine", PRESETS, preset, {"max_iterations": max_iterations})
+        at_least("self_refine", 1, feedback_tokens=feedback_tokens, **chosen)
+        self.services = services
+        self.max_iterations: int = chosen["max_iterations"]
+        self.feedback_tokens = feedback_tokens
+        self.history_tokens = history_tokens
+        self.memory_tokens = memory_tokens
+
+    def begin_episode(self, task: Task) -> None:
+        return None
+
+    async def lessons(self, input: AgentInput) -> Recall:
+        return Recall()
+
+    async def revise(self, input: AgentInput, recall: Recall, decision: Decision) -> Decision:
+        """The decision, refined; as far as the budget allows."""
+        draft = Draft(input, user_turn(input, recall, self.services, self.memory_tokens), decision)
+        draft.attempt(_shown(decision.action))
+        try:
+            await self._refine(draft)
+        except BudgetExceededError:
+            draft.stopped = "budget"
+        self._credit(decision, draft)
+        trace: dict[str, Any] = {
+            **draft.decision.trace,
+            "refinements": len(draft.tried),
+            "refining_ended": draft.stopped,
+        }
+        if draft.stopped == "budget":
+            trace["exhausted"] = trace.get("exhausted") or "episode"
+        return replace(draft.decision, trace=trace)
+
+    async def _refine(self, draft: Draft) -> None:
+        for _ in range(self.max_iterations):
+            feedback = await self.services.llm.generate(
+                "feedback", self._prompt(draft, ASK_FEEDBACK), max_tokens=self.feedback_tokens
+            )
+            text = feedback.text.strip()
+            verdicts = _VERDICT.findall(text)
+            if not text or (verdicts and verdicts[-1].casefold() == "keep"):
+                draft.stopped = "kept"
+                return
+            draft.history.append(FEEDBACK_ON.format(number=draft.attempts, feedback=_VERDICT.sub("", text).strip()))
+            if await self._another_attempt(draft):
+                draft.stopped = "unchanged"
+                return
+
+    async def _another_attempt(self, draft: Draft) -> bool:
+        """Refine once; whether the action stayed the same."""
+        schema = draft.input.action_schema
+        request = ASK_REFINED.format(how=MENU_ANSWER if schema.choices else CALL_ANSWER)
+        choices = {"choices": schema.choices} if schema.choices else {}
+        call = await self.services.llm.generate("refine", self._prompt(draft, request), **choices)
+        draft.tried.append(call)
+        action = read_action(call.text, schema)
+        if isinstance(action, ActionError):
+            draft.attempt(f"{_shown(action)}; the attempt before it stands")
+            return False
+        standing = draft.decision.action
+        if isinstance(standing, Action) and canonical(action, schema) == canonical(standing, schema):
+            return True
+        draft.attempt(action.text)
+        trace = {k: v for k, v in draft.decision.trace.items() if k != "fallback"}
+        draft.decision = replace(
+            draft.decision,
+            action=action,
+            calls=((call.id, 0),),
+            valid=True,
+            turn=(action.text,),
+            trace={**trace, "refined_from": draft.decision.action.text[:200]},
+        )
+        return False
+
+    def _prompt(self, draft: Draft, request: str) -> tuple[Message, ...]:
+        history = clip("\n".join(draft.history), self.history_tokens, self.services, keep="tail")
+        return (system(static_prompt(draft.input, ON_REQUEST)), user(f"{draft.situation}\n\n{history}\n\n{request}"))
+
+    def _credit(self, before: Decision, draft: Draft) -> None:
+        """Credit moves to the call whose action is executed; the agent credits that one itself."""
+        recorder = self.services.llm.recorder
+        for call in draft.tried:
+            recorder.credit(call.id, 0, "explored")
+        if draft.decision.calls == before.calls:
+            return
+        purposes = {call.id: call.tag.purpose for call in recorder.calls}
+        standing = tuple(c for c in before.calls if purposes.get(c[0]) == "plan")
+        for call_id, completion in before.calls:
+            recorder.credit(call_id, completion, "explored")
+        draft.decision = replace(draft.decision, calls=(*standing, *draft.decision.calls))
+
+    async def end_episode(self, trajectory: Trajectory) -> None:
+        return None
+
+    def snapshot(self) -> bytes:
+        return b""
+
+    def restore(self, blob: bytes) -> None:
+        return None
+
+
+def _shown(action: Action | ActionError) -> str:
+    if isinstance(action, Action):
+        return action.text
+    return f"{action.text[:120]!r}, which is not possible: {action.message[:200]}"

@@ -1,0 +1,101 @@
+"""What a checkpoint needs beyond TRL's, so that a resumed run equals the uninterrupted one.
+
+TRL and transformers save weights, optimiser, scheduler, their random states and the position in the data. A run inside
+a scaffold also has: the position within a generation round, rows that were generated and not yet used, and memories
+that outlive episodes. They are saved beside the rest as JSON (rows are token lists: nothing is pickled).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from agentspec.state import write_atomic
+from trainers.batches import Row
+from trainers.sequences import TokenSequence
+
+FILE = "scaffold_state.json"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class ScaffoldState:
+    """Position and buffers of a run at a checkpoint.
+
+    Args:
+        step: micro-batches done (TRL's ``_step``).
+        round: number of the generation round that filled the buffer.
+        buffered: micro-batches of the round, each a list of rows; empty at a round's end.
+        memory: state of a memory with ``scope: run``.
+    """
+
+    step: int
+    round: int
+    buffered: tuple[tuple[Row, ...], ...] = ()
+    memory: bytes | None = None
+
+
+def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
+    """Write this rank's state into a checkpoint folder, atomically."""
+    data = {
+        "format": FORMAT,
+        "step": state.step,
+        "round": state.round,
+        "buffered": [[_row_to_json(r) for r in hand] for hand in state.buffered],
+        "memory": None if state.memory is None else base64.b64encode(state.memory).decode(),
+    }
+    write_atomic(Path(folder) / _name(rank), json.dumps(data))
+
+
+def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:
+    """The state in a checkpoint folder; ``None`` if it holds none (a checkpoint of stock TRL).
+
+    Raises:
+        ValueError: a file of another format.
+    """
+    path = Path(folder) / _name(rank)
+    if not path.is_file():
+        return None
+    data = json.loads(path.read_text(encoding="utf-8"))
+    if data.get("format") != FORMAT:
+        raise ValueError(
+            f"{path}: format {data.get('format')!r}, expected {FORMAT}; resume with the version that wrote it"
+        )
+    return ScaffoldState(
+        step=data["step"],
+        round=data["round"],
+        buffered=tuple(tuple(_row_from_json(r) for r in hand) for hand in data["buffered"]),
+        memory=None if data["memory"] is None else base64.b64decode(data["memory"]),
+    )
+
+
+def _name(rank: int) -> str:
+    return FILE if rank == 0 else FILE.replace(".json", f".rank{rank}.json")
+
+
+def _row_to_json(row: Row) -> dict[str, Any]:
+    data = asdict(row)
+    data["sequence"]["allowed"] = [[p, list(ids)] for p, ids in row.sequence.allowed.items()]
+    return data
+
+
+def _row_from_json(data: dict[str, Any]) -> Row:
+    fields = dict(data["sequence"])
+    fields["allowed"] = {p: tuple(ids) for p, ids in fields["allowed"]}
+    advantage = data["advantage"]
+    return Row(TokenSequence(**fields), tuple(advantage) if isinstance(advantage, list) else advantage, data["episode"])
+
+
+def rewind_logs(log: Any, step: int) -> None:
+    """Drop what the logs hold beyond checkpoint ``step``: the resumed run writes it again."""
+    log.rewind("metrics.jsonl", "step", step)
+    log.rewind("updates.jsonl", "round", step - 1)
+
+
+def rows_of(batches: Sequence[dict[str, Any]] | None, key: str) -> tuple[tuple[Row, ...], ...]:
+    """The rows of buffered micro-batches."""
+    return tuple(tuple(batch[key]) for batch in batches or ())
