@@ -74,6 +74,7 @@ class ScaffoldConfig(GRPOConfig):
         lora_r: rank of a new LoRA adapter; 0 trains all weights.
         lora_alpha: scale of the adapter (0: twice the rank).
         lora_targets: module names that carry LoRA (``all-linear`` or a list).
+        lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         plots: write the reward curve as PNG when training ends.
@@ -105,6 +106,7 @@ class ScaffoldConfig(GRPOConfig):
     lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
     lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
     lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
+    lora_layers: int = field(default=0, metadata={"help": "top layers that carry LoRA; 0: all"})
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})

@@ -23,6 +23,7 @@ from agentspec.episode import MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
+from trainers.audit import receipt_rows
 from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.resume import ScaffoldState, load_state, rewind_logs, rows_of, save_state
@@ -300,26 +301,23 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
-        """The receipt of a generation round (main process)."""
+        """The receipt of a generation round: what every rank contributed, written by the main process."""
+        first = self.accelerator.process_index * len(self._episodes)
+        receipts = [{**r, "episode": first + r["episode"]} for r in receipt_rows(rows)]
+        blank = sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])
+        episodes = [(t.episode, self.rewards_used.total(t)) for t in self._episodes]
+        everyone = {"rows": gather_object(receipts), "blank": gather_object([blank])}
+        played = gather_object(episodes)
         if not self.accelerator.is_main_process:
             return
-        totals = [self.rewards_used.total(t) for t in self._episodes]
         self.run_log.append(
             "updates.jsonl",
             {
                 "round": self._round,
-                "episodes": [t.episode for t in self._episodes],
-                "returns": totals,
-                "unscorable": [t.episode for t in self._episodes if not t.scorable],
-                "rows": [
-                    {
-                        "episode": r.episode,
-                        "tokens": len(r.sequence),
-                        "trained": r.sequence.trained,
-                        "advantage": r.advantage,
-                    }
-                    for r in rows
-                ],
+                "episodes": [name for name, _ in played],
+                "returns": [value for _, value in played],
+                "rows": everyone["rows"],
+                "blank_rows": sum(everyone["blank"]),
                 "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
                 "estimator": self.args.estimator,
                 "loss_type": self.loss_type,

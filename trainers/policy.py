@@ -40,16 +40,30 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
             raise LLMError(f"adapter {config.adapter!r} cannot be loaded: {error}") from error
     if config.lora_r == 0:
         return model, tokenizer
-    targets: Any = config.lora_targets[0] if config.lora_targets == ["all-linear"] else config.lora_targets
+    layers = model.config.get_text_config().num_hidden_layers
+    if not 0 <= config.lora_layers <= layers:
+        raise SpecError(f"lora_layers is {config.lora_layers}; {config.model} has {layers} layers (0 means all)")
+    top = list(range(layers - config.lora_layers, layers)) if config.lora_layers else None
     lora = LoraConfig(
+        layers_to_transform=top,
         r=config.lora_r,
         lora_alpha=config.lora_alpha or 2 * config.lora_r,
-        target_modules=targets,
+        target_modules=_targets(model, config),
         lora_dropout=0.0,  # dropout would make the update's log-probabilities differ from the sampled ones
         task_type="CAUSAL_LM",
     )
     torch.manual_seed(config.seed)
     return get_peft_model(model, lora), tokenizer
+
+
+def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
+    """Names of the modules that carry LoRA; ``all-linear`` is every linear layer except the output projection."""
+    if config.lora_targets != ["all-linear"]:
+        return config.lora_targets
+    wrapper: Any = model
+    head = wrapper.get_output_embeddings()
+    named = model.named_modules()
+    return sorted({n.rpartition(".")[2] for n, m in named if isinstance(m, nn.Linear) and m is not head})
 
 
 def resolve_adapter(name: str) -> str:

@@ -1,7 +1,8 @@
 """Chain of thought (Wei et al., 2022): think step by step, then act. The chain is not carried to the next step.
 
 With free-text actions one call writes the chain and a last line ``Action: ...``. In menu mode the chain is one call and
-the action a second one, decoded under the menu's constraint with the chain in its prompt.
+the action a second one, decoded under the menu's constraint with the chain in its prompt. With ``enable_history`` the
+chains do stay in the conversation, as sampled.
 """
 
 from __future__ import annotations
@@ -33,10 +34,18 @@ class ChainOfThought(Stateless):
     Args:
         memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
+        enable_history: keep the chains in the conversation.
     """
 
-    def __init__(self, services: Services, memory_tokens: int = 512, thought_tokens: int | None = None) -> None:
+    def __init__(
+        self,
+        services: Services,
+        memory_tokens: int = 512,
+        thought_tokens: int | None = None,
+        enable_history: bool = False,
+    ) -> None:
         self.services = services
+        self.history = enable_history
         self.memory_tokens = memory_tokens
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
@@ -49,13 +58,17 @@ class ChainOfThought(Stateless):
         answer = last_action_line(call.text)
         action = parse_action(call.text if answer is None else answer, input.action_schema)
         valid = isinstance(action, Action)
-        return Decision(action, rationale=call.text, calls=((call.id, 0),), valid=valid, turn=(action.text,))
+        turn = sampled(call) if self.history else action.text
+        return Decision(action, rationale=call.text, calls=((call.id, 0),), valid=valid, turn=(turn,))
 
     async def _think_then_choose(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services, self.memory_tokens)
         messages = self.services.context.prompt(static_prompt(input, THINK), dynamic)
         thought = await self.services.llm.generate("think", messages, **self.limit)
-        follow_up = (*messages, assistant(sampled(thought)), user(MENU_ANSWER))
+        if self.history:
+            follow_up = self.services.context.think((sampled(thought),), MENU_ANSWER)
+        else:
+            follow_up = (*messages, assistant(sampled(thought)), user(MENU_ANSWER))
         action, call = await ask_action(self.services, follow_up, input.action_schema)
         return Decision(
             action,

@@ -1,10 +1,10 @@
-"""Self-Refine (Madaan et al., 2023): feedback on a first answer, another answer, and again, until the critic is content.
+"""Self-Refine (Madaan et al., 2023): feedback on an answer, another answer, and again, until the critic is content.
 
-One model plays two roles in separate calls. The critic sees the situation and the candidate action before it is executed
-and says what is wrong with it; the refiner answers anew. Both are shown the whole history of attempts and feedback. It
-ends when the critic keeps the action, when a refinement changes nothing, or after ``max_iterations``. A refinement that
-is no legal action is ignored: the action stands, and the history says so. An illegal first action is shown to the critic
-with its error, so the method repairs what a reasoner could not parse.
+One model plays two roles in separate calls. The critic sees the situation and the candidate action before it is
+executed and says what is wrong with it; the refiner answers anew. Both are shown the whole history of attempts and
+feedback. It ends when the critic keeps the action, when a refinement changes nothing, or after ``max_iterations``. A
+refinement that is no legal action is ignored: the action stands, and the history says so. An illegal first action is
+shown to the critic with its error, so the method repairs what a reasoner could not parse.
 
 When an action is replaced its calls are credited as explored and the refining call as executed; a plan that goes on to
 guide later steps keeps its credit.

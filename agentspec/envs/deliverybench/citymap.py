@@ -28,7 +28,7 @@ from agentspec.envs.deliverybench.geometry import Point, rounded
 from agentspec.envs.deliverybench.graph import Graph, all_pairs
 from agentspec.envs.deliverybench.routing import DistanceField, Network, Router
 
-__all__ = ["BusRoute", "City", "MapError", "Poi", "Point", "Road", "build_city", "load_city"]
+__all__ = ["BusRoute", "City", "MapError", "Poi", "Point", "Road", "build_city", "forget_cities", "load_city"]
 
 ROADS_FILE = "roads.json"
 WORLD_FILE = "progen_world_enriched.json"
@@ -222,6 +222,12 @@ def load_city(path: str | Path) -> City:
                 _memory.pop(next(iter(_memory)))
             city = _memory[key] = _load(folder, documents, *key)
         return city
+
+
+def forget_cities() -> None:
+    """Drop all loaded cities from memory, with the ways found in them; the next `load_city` reads the disk cache."""
+    with _lock:
+        _memory.clear()
 
 
 def _load(folder: Path, documents: list[bytes], name: str, key: str) -> City:

@@ -11,8 +11,8 @@ In menu mode (`action_mode="menu"`) the action is one of `info["action_schema"].
 
 from __future__ import annotations
 
-import hashlib
 import json
+import re
 import string
 from collections.abc import Mapping
 from dataclasses import replace
@@ -29,9 +29,10 @@ from agentspec.envs.deliverybench.citymap import City, load_city
 from agentspec.envs.deliverybench.events import Progress, events_since
 from agentspec.envs.deliverybench.generate import generate
 from agentspec.envs.deliverybench.menu import Option, options
-from agentspec.envs.deliverybench.observation import compact_text, full_text, instruction, surroundings
+from agentspec.envs.deliverybench.observation import around, compact_text, full_text, instruction
 from agentspec.envs.deliverybench.rules import Rules, rules_named
-from agentspec.envs.deliverybench.view import OfferCards, describe
+from agentspec.envs.deliverybench.thinking import ThinkTime
+from agentspec.envs.deliverybench.view import OfferCards, describe, state_hash
 from agentspec.envs.deliverybench.world import Outcome, World
 from agentspec.types import ActionError, ActionSchema
 
@@ -63,6 +64,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         order_seed: "seed" (orders follow the reset seed), "original" (the one sequence of the original runner, whatever
             the seed), or a number.
         start_battery: battery of the scooter at the start (%), None as the rules say.
+        think_time: "paused", or seconds of the shift that deliberation costs: {"call": s, "token": s} (see `ThinkTime`
+            and `deliberate`).
         render_mode: None or "rgb_array".
         images: put the map picture into the observation as "image", uint8 (480, 720, 3).
 
@@ -85,6 +88,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         max_steps: int | None = None,
         order_seed: int | str | None = "seed",
         start_battery: float | None = None,
+        think_time: str | Mapping[str, float] | ThinkTime = "paused",
         render_mode: str | None = None,
         images: bool = False,
     ) -> None:
@@ -97,6 +101,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             raise ValueError(f"max_steps is {max_steps}; expected at least 1, or None")
         self.city = city_of(map, size, city_seed)
         self.rules = _adapted(rules_named(rules), max_steps, start_battery)
+        self.think_time = ThinkTime.of(think_time)
         self.shift_hours = shift_hours
         self.compact = observation == "compact"
         self.menu_mode = action_mode == "menu"
@@ -140,9 +145,22 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         self._world = World(self.city, self.rules, orders, self.shift_hours)
         self._cards = OfferCards(self._world.book)
         self._steps = 0
+        self._thought: list[int] | None = None
         self._last = _Last()
         self._track: list[list[float | str]] = [[self._world.state.mode, *self._world.state.position]]
         return self.observe()
+
+    def deliberate(self, calls: int = 1, tokens: int = 0) -> None:
+        """Report what the next action took to decide: model calls and tokens written, charged as `think_time` says.
+
+        A step that nobody reported on counts as one call.
+
+        Raises:
+            ValueError: negative numbers.
+        """
+        if calls < 0 or tokens < 0:
+            raise ValueError(f"got {calls} calls and {tokens} tokens; expected numbers of at least 0")
+        self._thought = [int(calls), int(tokens)]
 
     def step(self, action: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one action given as text; no text raises. After the end nothing happens any more."""
@@ -152,7 +170,10 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         before = Progress.of(world)
         balance = world.state.balance
         mode = world.state.mode
-        outcome = world.step(call)
+        calls, tokens = self._thought or (1, 0)
+        thought = self.think_time.seconds(calls, tokens)
+        outcome = world.step(call, thought)
+        self._thought = None
         self._steps += 1
         self._last = _Last.of(outcome, call, problem, events_since(before, world, outcome))
         if world.state.position != tuple(self._track[-1][1:]):
@@ -174,7 +195,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             said = last.error or (last.message if not choices or "delivered" in last.events else "")
             text = compact_text(view, said, choices)
         else:
-            text = full_text(view, surroundings(self.city, view))
+            text = full_text(view, around(self.city, world.state.position, view))
             if choices:
                 text += "\n\nChoices: " + "; ".join(choices)
         observation: Observation = {"text": _printable(text)}
@@ -198,6 +219,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "steps": self._steps,
             "last": self._last.dump(),
             "track": self._track,
+            "thought": self._thought,
         }
         return json.dumps(state, separators=(",", ":")).encode("utf-8")
 
@@ -211,6 +233,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             state = json.loads(blob)
             version, seed = state["version"], state["seed"]
             blob, steps, last, track = state["world"].encode("utf-8"), state["steps"], state["last"], state["track"]
+            thought = state["thought"]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"these bytes are no snapshot of a DeliveryBench environment ({error!r})") from error
         if version != SNAPSHOT_VERSION:
@@ -219,8 +242,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             self._world = World(self.city, self.rules, seed, self.shift_hours)
             self._cards = OfferCards(self._world.book)
         self._world.restore(blob)
-        self._steps, self._last, self._track = steps, _Last(**last), track
-        self._menu = self._options(describe(self._world, self._cards))
+        self._steps, self._last, self._track, self._thought = steps, _Last(**last), track, thought
+        self._menu = self._options(describe(self._world, self._cards)) if self.menu_mode else {}
 
     # -- internals ---------------------------------------------------------------------------------------------
 
@@ -332,25 +355,6 @@ class _Last:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-def state_hash(view: Mapping[str, Any]) -> str:
-    """A short hash of what matters for the next decision, equal for states that differ only in small change: place to
-    5 m, battery and energy to 10 %, clock to the minute, and the orders with their status."""
-    x, y = view["position"]
-    facts = (
-        round(x / 5.0),
-        round(y / 5.0),
-        view["mode"],
-        int(view["battery"] // 10),
-        int(view["energy"] // 10),
-        int(view["clock_s"] // 60),
-        view["charging"] is not None,
-        tuple((order["id"], order["status"]) for order in view["orders"]),
-        tuple(offer["id"] for offer in view["offers"]),
-        tuple(sorted(view["inventory"].items())),
-    )
-    return hashlib.blake2b(repr(facts).encode("utf-8"), digest_size=8).hexdigest()
-
-
 def _adapted(rules: Rules, max_steps: int | None, start_battery: float | None) -> Rules:
     if max_steps is not None:
         rules = replace(rules, max_calls=None)
@@ -366,11 +370,9 @@ def _check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
         raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
 
 
-_PRINTABLE = frozenset(CHARSET)
+_UNPRINTABLE = re.compile(f"[^{re.escape(CHARSET)}]")
 
 
 def _printable(text: str) -> str:
     # Messages quote what the agent wrote; the text space holds printable ASCII only.
-    if text.isascii() and text.isprintable():
-        return text
-    return "".join(c if c in _PRINTABLE else "?" for c in text)[:MAX_TEXT]
+    return _UNPRINTABLE.sub("?", text)[:MAX_TEXT]

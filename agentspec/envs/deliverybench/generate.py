@@ -31,6 +31,7 @@ SPLITS: Mapping[str, range] = {
     "validation": range(10_000, 20_000),
     "test": range(20_000, 30_000),
 }
+"""City seeds of each split (see `split_of`)."""
 
 BLOCK_M = 200
 FRONT_CM = 2700.0

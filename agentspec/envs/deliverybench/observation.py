@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.envs.deliverybench import calls
-from agentspec.envs.deliverybench.citymap import City
+from agentspec.envs.deliverybench.citymap import City, Point
 from agentspec.envs.deliverybench.menu import best_offers
 from agentspec.envs.deliverybench.rules import Rules
 from agentspec.envs.deliverybench.view import IN_BAG, IN_HAND, PREPARING, SERVICES
@@ -93,14 +93,14 @@ def _places(city: City) -> str:
 # -- the full text ---------------------------------------------------------------------------------------------------
 
 
-def full_text(view: View, extra: Mapping[str, Any]) -> str:
-    """The full dynamic text. `extra` holds `ways` and `junctions` (see `surroundings`)."""
+def full_text(view: View, surrounding: str) -> str:
+    """The full dynamic text. `surrounding` is the section that `around` writes."""
     sections = [
         _courier(view),
         _listing("Your orders", [_order_line(order) for order in view["orders"]], "none accepted"),
         _hand_and_bag(view),
         _offers(view),
-        _around(view, extra),
+        surrounding,
         _listing("Recent actions", [*view["recent"][:-1], *(f"{a} (newest)" for a in view["recent"][-1:])], "none"),
     ]
     if view["error"]:
@@ -111,22 +111,28 @@ def full_text(view: View, extra: Mapping[str, Any]) -> str:
     return "\n\n".join(section for section in sections if section)
 
 
-def surroundings(city: City, view: View, limit: int = 8) -> dict[str, list[tuple[str, Sequence[float], int]]]:
-    """Street points next to the courier: `ways` (any) and `junctions`, each (road, point in metres, metres), nearest
+def surroundings(city: City, point: Point, limit: int = 8) -> dict[str, list[tuple[str, Sequence[float], int]]]:
+    """Street points next to `point` (cm): `ways` (any) and `junctions`, each (road, point in metres, metres), nearest
     first, at most `limit` of each."""
-    x, y = view["position"]
-    field = city.distances_from((x * 100.0, y * 100.0))
-    found: dict[str, list[tuple[str, Sequence[float], int]]] = {"ways": [], "junctions": []}
+    field = city.distances_from(point)
     graph = city.walk
-    near = sorted((field.to_node(i), i) for i, kind in enumerate(graph.kinds) if kind in ("normal", "intersection"))
-    for d, i in near:
-        kind = "junctions" if graph.kinds[i] == "intersection" else "ways"
-        if d > 0.0 and len(found[kind]) < limit:
+    found: dict[str, list[tuple[str, Sequence[float], int]]] = {}
+    for title, kind in (("ways", "normal"), ("junctions", "intersection")):
+        points: list[tuple[str, Sequence[float], int]] = []
+        for d, i in field.nearest_nodes(kind, limit):
             px, py = graph.points[i]
-            found[kind].append((graph.names[i], (px / 100.0, py / 100.0), round((d + field.gap) / 100.0)))
-        if all(len(points) >= limit for points in found.values()):
-            break
+            points.append((graph.names[i], (px / 100.0, py / 100.0), round((d + field.gap) / 100.0)))
+        found[title] = points
     return found
+
+
+def around(city: City, point: Point, view: View) -> str:
+    """The section about the surroundings of the courier, who stands at `point` (cm): written once for each place."""
+    memo = city.distances_from(point).memo
+    text: str | None = memo.get("around")
+    if text is None:
+        text = memo["around"] = _around(view, surroundings(city, point))
+    return text
 
 
 def _courier(view: View) -> str:
@@ -349,4 +355,4 @@ def _cut(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
-__all__ = ["compact_text", "full_text", "instruction", "surroundings"]
+__all__ = ["around", "compact_text", "full_text", "instruction", "surroundings"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ __all__ = ["DistanceField", "Graph", "Network", "Router", "Snap", "SnapIndex", "
 CELL_CM = 2500.0
 FAR_CM = 1e8
 MEMO_LIMIT = 65536
+FIELD_LIMIT = 8192
 # Two ways count as equally short when they differ by less than the rounding of coordinates can explain.
 DETOUR_CM = 1e-3
 
@@ -135,6 +136,7 @@ class Network:
         self._to: dict[int, list[float]] = {}
         self._from: dict[int, tuple[list[float], list[int]]] = {}
         self._turned = graph.turned() if graph.one_way else graph
+        self._near: dict[tuple[int, str, int], list[int]] = {}
 
     def to_node(self, node: int) -> list[float]:
         """Distance (cm) from every node to `node`."""
@@ -148,6 +150,16 @@ class Network:
     def from_node(self, node: int) -> list[float]:
         """Distance (cm) from `node` to every node."""
         return self._tree(node)[0]
+
+    def nearest_nodes(self, node: int, kind: str, count: int) -> list[int]:
+        """The `count` nodes of a kind nearest to `node` by way (itself included), nearest first."""
+        key = (node, kind, count)
+        found = self._near.get(key)
+        if found is None:
+            row = self.from_node(node)
+            members = (i for i, k in enumerate(self.graph.kinds) if k == kind)
+            found = self._near[key] = heapq.nsmallest(count, members, key=lambda i: (row[i], i))
+        return found
 
     def _tree(self, node: int) -> tuple[list[float], list[int]]:
         tree = self._from.get(node)
@@ -228,24 +240,42 @@ class Network:
 
 
 class DistanceField:
-    """Path distances (cm) from one street point to every place: the shorter of the ways through its two neighbours."""
+    """Path distances (cm) from one street point to every place: the shorter of the ways through its two neighbours.
 
-    __slots__ = ("_anchors", "_rows", "foot", "gap")
+    `memo` keeps what others derive from the field, such as descriptions of a place's surroundings.
+    """
+
+    __slots__ = ("_anchors", "_network", "_nodes", "_rows", "foot", "gap", "memo")
 
     def __init__(self, network: Network, p: Point, anchors: dict[str, int]) -> None:
         snap = network.snaps.snap(p)
         self.foot = snap.foot
         self.gap = distance(p, snap.foot)
+        self._network = network
+        self._nodes = [node for node, _ in snap.links]
         self._rows = [(network.from_node(node), cost) for node, cost in snap.links]
         self._anchors = anchors
+        self.memo: dict[str, Any] = {}
 
     def to_node(self, node: int) -> float:
         """Distance (cm) from the foot to a node of the walk network."""
-        return min(cost + row[node] for row, cost in self._rows)
+        best = math.inf
+        for row, cost in self._rows:
+            d = cost + row[node]
+            if d < best:  # noqa: PLR1730 - a call of min() would double the cost of the commonest look-up
+                best = d
+        return best
 
     def to(self, poi: Poi) -> float:
         """Distance (cm) from the foot to a place's anchor; the straight gap from the point to its foot is not in it."""
         return self.to_node(self._anchors[poi.id])
+
+    def nearest_nodes(self, kind: str, count: int) -> list[tuple[float, int]]:
+        """The `count` nodes of a kind nearest to the foot, without the foot itself: (distance in cm, node)."""
+        # Whatever is near through one neighbour is near that neighbour; one more, because the foot may be a node.
+        near = {i for node in self._nodes for i in self._network.nearest_nodes(node, kind, count + 1)}
+        found = sorted((self.to_node(i), i) for i in near)
+        return [pair for pair in found if pair[0] > 0.0][:count]
 
 
 class Router:
@@ -283,7 +313,7 @@ class Router:
         """Path distances from the street point nearest to `p`."""
         found = self._fields.get(p)
         if found is None:
-            if len(self._fields) >= MEMO_LIMIT:
+            if len(self._fields) >= FIELD_LIMIT:
                 self._fields.clear()
             found = self._fields[p] = DistanceField(self.walk, p, self.anchors)
         return found

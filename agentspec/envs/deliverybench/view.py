@@ -9,7 +9,9 @@ food would be ready from what it contains.
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from agentspec.envs.deliverybench.bus import BusPhase
@@ -84,6 +86,25 @@ def describe(world: World, cards: OfferCards) -> dict[str, Any]:
         "error": state.error,
         "notices": [{"kind": notice.kind, "text": notice.text} for notice in state.notices],
     }
+
+
+def state_hash(view: Mapping[str, Any]) -> str:
+    """A short hash of what matters for the next decision, equal for states that differ only in small change: place to
+    5 m, battery and energy to 10 %, clock to the minute, and the orders with their status."""
+    x, y = view["position"]
+    facts = (
+        round(x / 5.0),
+        round(y / 5.0),
+        view["mode"],
+        int(view["battery"] // 10),
+        int(view["energy"] // 10),
+        int(view["clock_s"] // 60),
+        view["charging"] is not None,
+        tuple((order["id"], order["status"]) for order in view["orders"]),
+        tuple(offer["id"] for offer in view["offers"]),
+        tuple(sorted(view["inventory"].items())),
+    )
+    return hashlib.blake2b(repr(facts).encode("utf-8"), digest_size=8).hexdigest()
 
 
 def way(field: DistanceField, poi: Poi) -> int:
@@ -165,13 +186,15 @@ def _bag(state: State) -> dict[str, Any]:
 
 def _nearest(world: World, field: DistanceField) -> dict[str, Any]:
     """The nearest place of each service kind by way: name, position, metres."""
-    found = {}
-    for kind in SERVICES:
-        places = world.city.pois_of(kind)
-        if places:
-            poi = min(places, key=field.to)
-            found[kind] = {"name": poi.name, "xy": metres(poi.anchor), "m": way(field, poi)}
-    return found
+    known: dict[str, Card] | None = field.memo.get("nearest")
+    if known is None:
+        known = field.memo["nearest"] = {}
+        for kind in SERVICES:
+            places = world.city.pois_of(kind)
+            if places:
+                poi = min(places, key=field.to)
+                known[kind] = {"name": poi.name, "xy": metres(poi.anchor), "m": way(field, poi)}
+    return {kind: {**card} for kind, card in known.items()}
 
 
 def _bus(phase: BusPhase | None, clock: float) -> dict[str, Any] | None:

@@ -12,20 +12,18 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from agentspec.actions import parse_action
 from agentspec.envs.deliverybench import moving, services, vehicles, work
 from agentspec.envs.deliverybench.bag import MAX_DAMAGE, Bag
-from agentspec.envs.deliverybench.bus import BusTimetable
 from agentspec.envs.deliverybench.citymap import City
-from agentspec.envs.deliverybench.clock import ShiftOver, stop_charging
+from agentspec.envs.deliverybench.clock import ShiftOver, pass_time, stop_charging
 from agentspec.envs.deliverybench.food import toward_ambient
 from agentspec.envs.deliverybench.grammar import Refused, schema_for
-from agentspec.envs.deliverybench.orders import OrderBook
 from agentspec.envs.deliverybench.recorder import Recorder, evaluate, report
 from agentspec.envs.deliverybench.rules import Rules, rules_named
 from agentspec.envs.deliverybench.settlement import Settlement
+from agentspec.envs.deliverybench.shared import shared
 from agentspec.envs.deliverybench.snapshot import dump, load
 from agentspec.envs.deliverybench.state import DEPLETED, PARKED, USABLE, Notice, Point, Scooter, State
 from agentspec.types import Action, ActionError, ActionSchema
@@ -127,7 +125,7 @@ class World:
         self.schema: ActionSchema = schema_for(self.rules)
         self.shift_ticks = max(1, math.ceil(shift_hours * 3600.0 * self.rules.ticks_per_second - 1e-6))
         self.last_tick = self.shift_ticks
-        self.book, self.timetable = _shared(city, self.rules, seed)
+        self.book, self.timetable = shared(city, self.rules, seed)
         self.recorder = Recorder()
         self._identity = [city.name, self.rules.name, seed, self.shift_ticks]
         self._inert = self.rules.hand_food_is_inert
@@ -148,10 +146,11 @@ class World:
 
     # -- one step ----------------------------------------------------------------------------------------------
 
-    def step(self, text: str | Action) -> Outcome:
+    def step(self, text: str | Action, thought: float = 0.0) -> Outcome:
         """Carry out one action, given as text (or already parsed). Never raises, whatever the text.
 
-        After the end of the episode nothing happens any more (code ENDED).
+        ``thought`` seconds of deliberation pass first. After the end of the episode nothing happens any more (code
+        ENDED).
         """
         state = self.state
         action = text if isinstance(text, Action) else parse_action(text, self.schema)
@@ -159,6 +158,12 @@ class World:
         if state.ended:
             return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
         state.calls += 1
+        if thought > 0.0:
+            try:
+                pass_time(self, state.tick + math.ceil(thought * self.rules.ticks_per_second - 1e-6))
+            except ShiftOver:
+                message = "the shift ended while you were thinking"
+                return self._outcome(None, "", message, start, delivered, action)
         last = self.max_calls is not None and state.calls >= self.max_calls
         if last and self.rules.last_call_is_cut:
             self.last_tick = min(self.shift_ticks, state.tick + 1)
@@ -371,25 +376,3 @@ class World:
         for order in state.orders.values():
             for item in order.pending:
                 item.temp = toward_ambient(item.temp, rules.ambient, rules.food_rate, seconds)
-
-
-_cache: WeakKeyDictionary[City, dict[Any, Any]] = WeakKeyDictionary()
-
-
-def _shared(city: City, rules: Rules, seed: int | None) -> tuple[OrderBook, BusTimetable]:
-    """Order book and timetable: functions of city, rules and seed only, shared by all worlds."""
-    store = _cache.setdefault(city, {})
-    order_rules = (rules.note_probability, rules.pay_per_km, rules.eta_speed, rules.eta_slack)
-    book_key = ("book", seed, order_rules)
-    book = store.get(book_key)
-    if book is None:
-        books = [key for key in store if key[0] == "book"]
-        for key in books[:-64]:
-            del store[key]
-        book = store[book_key] = OrderBook(city, rules, seed)
-    bus_key = ("bus", rules.bus_dwell, rules.speed["bus"], rules.odd_bus_line)
-    timetable = store.get(bus_key)
-    if timetable is None:
-        line = city.bus
-        timetable = store[bus_key] = BusTimetable(line.stop_names, line.stops, line.points, rules)
-    return book, timetable

@@ -1,7 +1,8 @@
 """The two worlds a search can move in: the environment itself, and the model's idea of it.
 
 Both take a node's parent state and action to an :class:`Outcome`. The environment is exact and is put back by its
-user; the model predicts in words what would be observed, and whether the goal would be reached.
+user; the model predicts in words what would be observed, and whether the task would be accomplished, or over without
+that.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from agentspec.types import ActionSchema, AgentInput
 
 PREDICT = (
     "Nobody acts now; imagine. What would be observed after the last step above? Write the new situation in at most "
-    "three short sentences: only what changes, and the numbers that matter. Then write a last line 'Goal: yes' if the "
-    "task would be accomplished by then, otherwise 'Goal: no'."
+    "three short sentences: only what changes, and the numbers that matter. Then write a last line: 'Goal: yes' if the "
+    "task would be accomplished by then, 'Goal: over' if it would have ended without that, otherwise 'Goal: no'."
 )
 STEPS = "Steps tried in thought from here:\n{steps}"
 
-_GOAL = re.compile(r"\bgoal\W{0,4}(yes|no)\b", re.IGNORECASE)
+_GOAL = re.compile(r"\bgoal\W{0,4}(yes|no|over)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -115,9 +116,10 @@ class ModelWorld:
         request = f"{render_steps(node, self._services, self._path_tokens)}\n\n{PREDICT}"
         call = await self._meter.ask("world", with_request(self._base, request), **self._sampling)
         verdicts = _GOAL.findall(call.text)
-        reached = bool(verdicts) and verdicts[-1].casefold() == "yes"
+        verdict = verdicts[-1].casefold() if verdicts else "no"
+        reached, ended = verdict == "yes", verdict != "no"
         text = _GOAL.sub("", call.text).strip() or "nothing that could be foreseen"
-        return Outcome(None, text, node.parent.state.schema, float(reached), reached, True if reached else None)
+        return Outcome(None, text, node.parent.state.schema, float(reached), ended, reached if ended else None)
 
 
 def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -120,6 +122,29 @@ def test_order_seed_options() -> None:
     assert fixed.world.seed == 7
 
 
+def test_thinking_is_free_or_charged_by_call_and_token() -> None:
+    free, priced = tiny(), tiny(think_time={"call": 2.0, "token": 0.05})
+    free.reset(seed=0)
+    priced.reset(seed=0)
+    free.deliberate(3, 500)
+    assert free.step("WAIT(10)")[4]["seconds"] == 10.0
+    # Unreported: one call. Reported: 3 x 2 s + 40 x 0.05 s. A scripted agent reports none.
+    assert priced.step("WAIT(10)")[4]["seconds"] == 12.0
+    priced.deliberate(3, 40)
+    blob = priced.snapshot()
+    assert priced.step("WAIT(10)")[4]["seconds"] == 18.0
+    priced.restore(blob)
+    assert priced.step("WAIT(10)")[4]["seconds"] == 18.0
+    priced.deliberate(0, 0)
+    *_, info = priced.step("WAIT(10)")
+    assert info["seconds"] == 10.0 and info["state"]["clock_s"] == 12.0 + 18.0 + 10.0
+    priced.deliberate(1, 10**6)
+    *_, terminated, truncated, info = priced.step("ACCEPT_ORDER([1])")
+    assert terminated and not truncated and info["events"] == [] and "thinking" in info["message"]
+    with pytest.raises(ValueError, match="-1 calls"):
+        priced.deliberate(-1)
+
+
 def test_start_battery() -> None:
     assert tiny(start_battery=20.0).reset(seed=0)[1]["state"]["battery"] == 20.0
 
@@ -207,11 +232,18 @@ def test_step_before_reset_is_an_error() -> None:
     [
         {"observation": "long"}, {"action_mode": "free"}, {"render_mode": "human"}, {"order_seed": "random"},
         {"max_steps": 0}, {"start_battery": 101.0}, {"size": "huge"}, {"rules": "easy"},
+        {"think_time": "free"}, {"think_time": {"calls": 1}},
     ],
 )  # fmt: skip
 def test_wrong_arguments_are_explained(options: dict) -> None:
-    with pytest.raises(ValueError, match=str(next(iter(options.values())))):
+    with pytest.raises(ValueError, match=re.escape(str(next(iter(options.values()))))):
         tiny(**options)
+
+
+def test_think_time_prices_are_numbers() -> None:
+    for price in (-1.0, float("nan"), "2", True):
+        with pytest.raises(ValueError, match="think_time 'call' is"):
+            tiny(think_time={"call": price})
 
 
 def test_images_are_pictures() -> None:

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agentspec.envs import deliverybench
+from agentspec.envs.deliverybench.cities import main
 from agentspec.envs.deliverybench.citymap import City, load_city
 from agentspec.envs.deliverybench.generate import FRONT_CM, PLANS, SPLITS, documents, generate, split_of, write_city
 
@@ -107,3 +109,14 @@ def test_unknown_sizes_and_seeds_are_refused() -> None:
         generate("huge", 0)
     with pytest.raises(ValueError, match="seed -1"):
         generate("small", -1)
+
+
+def test_command_line_writes_cities_and_names_their_split(tmp_path, capsys) -> None:
+    assert main([str(tmp_path), "--size", "tiny", "--seed", "9999", "--count", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.rsplit("(")[-1] for line in lines] == ["train)", "validation)"]
+    loaded, made = load_city(tmp_path / "tiny-10000"), deliverybench.generate("tiny", 10_000)
+    assert [poi.anchor for poi in loaded.pois] == [poi.anchor for poi in made.pois]
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--seed", "30000"])
+    assert "belongs to no split" in capsys.readouterr().err

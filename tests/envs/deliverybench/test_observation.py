@@ -8,7 +8,7 @@ import pytest
 
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.observation import compact_text, full_text, instruction, surroundings
+from agentspec.envs.deliverybench.observation import around, compact_text, full_text, instruction, surroundings
 from agentspec.envs.deliverybench.rules import rules_named
 from agentspec.envs.deliverybench.view import OfferCards, describe
 from agentspec.envs.deliverybench.world import World
@@ -87,7 +87,7 @@ def test_full_text_has_its_sections_in_order() -> None:
     for action in ("ACCEPT_ORDER([0])", "FLY()", "VIEW_ORDERS()", "DROP_OFF(oid=0, method='knock')"):
         world.step(action)
     view = describe(world, cards)
-    text = full_text(view, surroundings(world.city, view))
+    text = full_text(view, around(world.city, world.state.position, view))
     titles = [
         "on the clock",
         "Your orders",
@@ -106,17 +106,23 @@ def test_full_text_has_its_sections_in_order() -> None:
 def test_offers_are_listed_only_after_looking_at_them() -> None:
     world, cards = fresh()
     view = describe(world, cards)
-    assert "10 orders are on offer; VIEW_ORDERS() lists them" in full_text(view, {})
+    assert "10 orders are on offer; VIEW_ORDERS() lists them" in full_text(view, "")
     world.step("VIEW_ORDERS()")
-    assert "- order 9: $" in full_text(describe(world, cards), {})
+    assert "- order 9: $" in full_text(describe(world, cards), "")
 
 
 def test_surroundings_are_sorted_and_reachable() -> None:
-    world, cards = fresh()
-    found = surroundings(world.city, describe(world, cards), limit=3)
+    world, _ = fresh()
+    found = surroundings(world.city, world.state.position, limit=3)
     for points in found.values():
         metres = [d for _, _, d in points]
         assert len(points) == 3 and metres == sorted(metres)
+    # As near as a look at every node of the city finds them.
+    field, graph = world.city.distances_from(world.state.position), world.city.walk
+    for kind, points in (("normal", found["ways"]), ("intersection", found["junctions"])):
+        every = sorted((field.to_node(i), i) for i, k in enumerate(graph.kinds) if k == kind)
+        nearest = [graph.points[i] for d, i in every if d > 0.0][:3]
+        assert [xy for _, xy, _ in points] == [(x / 100, y / 100) for x, y in nearest]
     assert found["junctions"][0][1] in {(x / 100, y / 100) for x, y in world.city.walk.points}
 
 
@@ -124,13 +130,13 @@ def test_late_orders_and_charging_are_shown() -> None:
     world, cards = fresh()
     world.step("ACCEPT_ORDER([0])")
     world.step(f"WAIT({world.book[0].limit + 61})")
-    text = full_text(describe(world, cards), {})
+    text = full_text(describe(world, cards), "")
     assert "order 0: ready, 2 min late" in text  # 61 s over the limit, whole minutes rounded up
     x, y = (c / 100 for c in world.city.pois_of("charging_station")[0].anchor)
     world.step(f"MOVE({x:.2f}m, {y:.2f}m)")
     world.step("CHARGE(target_pct=80)")
     view = describe(world, cards)
-    assert view["mode"] == "walk" and "charging to 80 %" in full_text(view, {})
+    assert view["mode"] == "walk" and "charging to 80 %" in full_text(view, "")
     assert "charging" in compact_text(view, "", ())
 
 

@@ -33,7 +33,9 @@ BOTH = ("original", "fair")
 def test_rule_sets() -> None:
     names = list(quirks())
     assert all(getattr(ORIGINAL, name) for name in names) and not any(getattr(FAIR, name) for name in names)
-    assert replace(FAIR, name="original", max_calls=200, max_active_orders=None, **dict.fromkeys(names, True)) == ORIGINAL
+    assert (
+        replace(FAIR, name="original", max_calls=200, max_active_orders=None, **dict.fromkeys(names, True)) == ORIGINAL
+    )
     assert rules_named("fair") is FAIR and rules_named(ORIGINAL) is ORIGINAL
     with pytest.raises(ValueError, match="unknown rule set 'cosy'"):
         rules_named("cosy")
@@ -95,6 +97,8 @@ def test_hand_food_is_shaken_in_fair() -> None:
         number = next(n for n in range(50) if any(food.fragile for food in w.book[n].foods))
         w.state.pool[0] = number
         collect(w, number)
+        # On foot, because nothing else moves with food in the hand under fair rules.
+        do(w, 'SWITCH("walk")')
         store = tiny().pois_of("hospital")[0].anchor
         w.step(f'MOVE({metres(store)}, pace="accel")')
         assert max(item.damage for item in w.state.orders[number].items) == damage

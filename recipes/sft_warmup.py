@@ -1,0 +1,64 @@
+"""A supervised warm start from the rule-based courier, in the prompt layout that GRPO will use.
+
+    accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
+
+The adapter in ``trainers/adapters/smollm2-135m-courier`` was made with this command. TRL's ``SFTTrainer`` trains on
+the tokens the expert chose; prompts and observations are context.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from recipes.common import parse_config, run_config, run_recipe
+
+
+def main() -> None:
+    """Demonstrate, train, save the adapter."""
+    config = parse_config(default="warmup_cpu.yaml")
+    train_warmup(config)
+
+
+def train_warmup(config: Any) -> None:
+    """Supervised training as ``config`` says: ``train_tasks`` demonstrations, ``num_train_epochs`` passes."""
+    from datasets import Dataset
+    from trl import SFTConfig, SFTTrainer
+
+    from trainers.demonstrations import demonstrate
+    from trainers.policy import load_policy
+    from trainers.rollouts import make_tasks
+    from trainers.runlog import RunLog
+
+    name, options = config.world
+    model, tokenizer = load_policy(config)
+    shown = demonstrate(config.spec, tokenizer, make_tasks(name, options, config.train_tasks))
+    returns = [float(t.metrics["return"]) for t in shown.episodes]
+    print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(shown.rows)} rows")
+    args = SFTConfig(
+        output_dir=config.output_dir,
+        per_device_train_batch_size=config.per_device_train_batch_size,
+        gradient_accumulation_steps=config.gradient_accumulation_steps,
+        num_train_epochs=config.num_train_epochs,
+        max_steps=config.max_steps,
+        learning_rate=config.learning_rate,
+        lr_scheduler_type=config.lr_scheduler_type,
+        warmup_steps=config.warmup_steps,
+        max_length=None,
+        logging_steps=config.logging_steps,
+        save_strategy="no",
+        report_to=config.report_to,
+        use_cpu=config.use_cpu,
+        bf16=config.bf16,
+        gradient_checkpointing=config.gradient_checkpointing,
+        seed=config.seed,
+    )
+    trainer = SFTTrainer(model, args, train_dataset=Dataset.from_list(shown.rows), processing_class=tokenizer)
+    trainer.train()
+    trainer.save_model(config.output_dir)
+    log = RunLog(Path(config.output_dir))
+    log.manifest(config=run_config(config), spec=config.spec.to_data(), demonstrations=len(returns))
+
+
+if __name__ == "__main__":
+    run_recipe(main)
