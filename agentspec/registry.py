@@ -244,7 +244,7 @@ register(
     "lats",
     "agentspec.reasoning.lats:LanguageAgentTreeSearch",
     "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
-    calls=CallProfile(step=(1, 1300)),
+    calls=CallProfile(step=(1, 1121)),
     rl=CallProfile(step=(1, 20)),
     purposes=("propose", "value", "reflect", "world"),
     needs=("n", "snapshots"),
@@ -277,3 +277,32 @@ register(
     calls=CallProfile(episode=(0, 1)),
     purposes=("reflect",),
 )
+
+
+def call_table(kinds: tuple[str, ...] = ("memory", "reasoning", "reflection")) -> str:
+    """The declared call profiles as a Markdown table, one row per module and preset: what the documentation shows."""
+    occasions = ("retrieve", "store", "step", "episode")
+    lines = [
+        "| kind | module | preset | " + " | ".join(f"calls per {o}" for o in occasions) + " | purposes | needs |",
+        "|---|---|---|" + "---|" * len(occasions) + "---|---|",
+    ]
+    for kind in kinds:
+        for name, entry in sorted(REGISTRY.entries.get(kind, {}).items()):
+            needs = [need + _waiver(entry, need) for need in entry.needs]
+            for preset, profile in (entry.presets or {"": entry.calls}).items():
+                counts = [_count(getattr(profile, occasion)) for occasion in occasions]
+                row = [kind, f"`{name}`", f"`{preset}`" if preset else "", *counts]
+                lines.append("| " + " | ".join([*row, ", ".join(entry.purposes), ", ".join(needs)]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _count(span: tuple[int, int]) -> str:
+    fewest, most = span
+    return str(most) if fewest == most else f"{fewest}–{most}"
+
+
+def _waiver(entry: Entry, need: str) -> str:
+    if need not in entry.waived:
+        return ""
+    name, value = entry.waived[need]
+    return f" (not with `{name}: {value}`)"

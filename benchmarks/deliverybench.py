@@ -41,6 +41,8 @@ from agentspec.envs.deliverybench.world import World
 REFERENCE_MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "deliverybench" / "maps"
 CITY = "medium-city-22"
 GENERATED_SEED = 0
+STEPS = 4000
+"""Steps for the figures of many environments in one process."""
 ORIGINAL_ACTIONS_PER_S = (21.0, 33.0)
 ORIGINAL_TEXT_S = (0.3, 0.9)
 GOALS = {"steps_per_s": 10_000, "steps_per_s_full_text": 2_000, "steps_per_s_menu": 5_000}
@@ -173,14 +175,14 @@ def memory(folder: Path, shifts: Shifts, count: int = 64) -> float:
     return used / len(envs)
 
 
-def many(folder: Path, shifts: Shifts, count: int, steps: int = 4000) -> float:
+def many(folder: Path, shifts: Shifts, count: int) -> float:
     """Steps per second with full text of ``count`` environments stepped in turn in this process."""
     envs = [DeliveryBenchEnv(map=folder) for _ in range(count)]
     for i, env in enumerate(envs):
         env.reset(seed=i % len(shifts))
     done, start = 0, time.process_time()
     position = [0] * count
-    while done < steps:
+    while done < STEPS:
         for i, env in enumerate(envs):
             actions = shifts[i % len(shifts)]
             if position[i] == len(actions):
@@ -246,10 +248,11 @@ def table(result: dict[str, Any]) -> str:
     shares = ", ".join(f"{n}: {rate:.0f}" for n, rate in result["envs_in_one_process"].items())
     lines.append(f"environments in one process, steps/s with full text: {shares}")
     (low, high), (text_low, text_high) = result["times_original_actions"], result["times_original_text"]
+    slow, fast = ORIGINAL_ACTIONS_PER_S
     lines += [
         "",
-        "Beside the original's published speed (its logic driven headless on the same kind of core; not measured here):",
-        f"  actions: {low:.0f} to {high:.0f} times its {ORIGINAL_ACTIONS_PER_S[0]:.0f}-{ORIGINAL_ACTIONS_PER_S[1]:.0f}/s",
+        "Beside the published speed of the original (its logic headless on the same kind of core; not measured here):",
+        f"  actions: {low:.0f} to {high:.0f} times its {slow:.0f}-{fast:.0f}/s",
         f"  one full text in {result['text_ms']:.3f} ms: {text_low:.0f} to {text_high:.0f} times faster than its "
         f"{ORIGINAL_TEXT_S[0]:g}-{ORIGINAL_TEXT_S[1]:g} s",
     ]

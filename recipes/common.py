@@ -82,6 +82,14 @@ def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
     return trainer
 
 
+def draw_curve(config: Any, trainer: Any) -> None:
+    """The reward curve as ``reward_curve.png`` in the run's folder (main process, if the config asks for plots)."""
+    if config.plots and trainer.accelerator.is_main_process:
+        from eval.plots import reward_curve
+
+        reward_curve(trainer.run_log.read("metrics.jsonl"), trainer.run_log.folder / "reward_curve.png")
+
+
 def run_config(config: Any) -> dict[str, Any]:
     """The configuration as plain data, secrets left out (TRL's own ``to_dict`` masks tokens)."""
     data: dict[str, Any] = config.to_dict()
@@ -90,11 +98,7 @@ def run_config(config: Any) -> dict[str, Any]:
 
 def run_recipe(main: Callable[[], None]) -> None:
     """Run a recipe; an expected error is one line and exit code 2."""
-    from agentspec.cli import fail
-    from agentspec.llm.base import LLMError
-    from agentspec.registry import SpecError
+    from agentspec.cli.errors import expected_errors
 
-    try:
+    with expected_errors():
         main()
-    except (SpecError, LLMError, FileNotFoundError) as error:
-        fail(error)

@@ -8,17 +8,13 @@ continues from the last checkpoint. On a GPU machine only the config changes (``
 
 from __future__ import annotations
 
-from recipes.common import parse_config, run_recipe, train
+from recipes.common import draw_curve, parse_config, run_recipe, train
 
 
 def main() -> None:
     """Train, save the adapter, draw the reward curve."""
     config = parse_config()
-    trainer = train(config)
-    if config.plots and trainer.accelerator.is_main_process:
-        from eval.plots import reward_curve
-
-        reward_curve(trainer.run_log.read("metrics.jsonl"), trainer.run_log.folder / "reward_curve.png")
+    draw_curve(config, train(config))
 
 
 if __name__ == "__main__":

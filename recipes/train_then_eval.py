@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recipes.common import parse_config, run_recipe, train
+from recipes.common import draw_curve, parse_config, run_recipe, train
 
 
 def main() -> None:
@@ -19,12 +19,8 @@ def main() -> None:
     trainer.accelerator.wait_for_everyone()
     if not trainer.accelerator.is_main_process:
         return
-    folder = Path(config.output_dir)
-    if config.plots:
-        from eval.plots import reward_curve
-
-        reward_curve(trainer.run_log.read("metrics.jsonl"), folder / "reward_curve.png")
-    evaluate_run(config, folder)
+    draw_curve(config, trainer)
+    evaluate_run(config, Path(config.output_dir))
 
 
 def evaluate_run(config: object, folder: Path) -> None:
@@ -48,7 +44,9 @@ def evaluate_run(config: object, folder: Path) -> None:
         Policy("rule_based"),
         Policy("random"),
     ]
-    rows = evaluate(policies, specs, tasks, out=folder / "evaluation.jsonl", sampling=config.evaluation_sampling)
+    rows = evaluate(
+        policies, specs, tasks, out=folder / "evaluation.jsonl", sampling=config.evaluation_sampling, replace_stale=True
+    )
     table = markdown(rows)
     (folder / "evaluation.md").write_text(table, encoding="utf-8")
     print(table)

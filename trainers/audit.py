@@ -95,7 +95,9 @@ def audit(run: str | Path, step: int | None = None) -> Iterator[Receipt]:
     if step is not None:
         records = [r for r in records if r["round"] == step]
         if not records:
-            raise SpecError(f"{folder} has no update {step}; it has {[r['round'] for r in RunLog(folder).read('updates.jsonl')]}")
+            raise SpecError(
+                f"{folder} has no update {step}; it has {[r['round'] for r in RunLog(folder).read('updates.jsonl')]}"
+            )
     config = _config(manifest["config"])
     for record in records:
         yield _audit_update(folder, record, config)
@@ -155,9 +157,7 @@ def _check_identity(episodes: Sequence[Trajectory], record: dict[str, Any], rece
         receipt.violations.append(f"episodes {strangers} were not played by policy {expected}")
 
 
-def _check_rows(
-    rows: Sequence[Row], episodes: Sequence[Trajectory], record: dict[str, Any], receipt: Receipt
-) -> None:
+def _check_rows(rows: Sequence[Row], episodes: Sequence[Trajectory], record: dict[str, Any], receipt: Receipt) -> None:
     """The rows rebuilt from the episodes are those the loss read."""
     rebuilt = sorted(r["digest"] for r in receipt_rows(rows))
     logged = sorted(r["digest"] for r in record["rows"])

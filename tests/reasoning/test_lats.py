@@ -102,7 +102,7 @@ def test_visits_are_conserved() -> None:
 
 def test_reflections_come_after_failures_only_and_are_capped() -> None:
     spec = {"name": "lats", "max_reflections": 2, "rollout": "value"}
-    trajectory, requests = play(climber, {"reasoning": spec}, target=1000, steps=2)
+    _, requests = play(climber, {"reasoning": spec}, target=1000, steps=2)
     assert "reflect" in purposes(requests)
     learnt: list[str] = []
     for request in requests:
@@ -134,7 +134,7 @@ def test_the_root_gets_more_samples_and_equal_ones_are_merged() -> None:
 
 
 def test_a_budget_returns_the_best_so_far_flagged() -> None:
-    trajectory, requests = play(climber, {"reasoning": {"name": "lats", "max_calls": 3}})
+    trajectory, _ = play(climber, {"reasoning": {"name": "lats", "max_calls": 3}})
     decision = trajectory.transitions[0].decision
     # 1 proposal and 2 of 3 ratings; no iteration came to its end. ADD: 0.5 * 9/10 + 0.5 * share(4 of 10) = 0.65.
     assert decision.trace["calls"] == 3 and decision.trace["exhausted"] == "calls" and decision.valid

@@ -1,4 +1,4 @@
-"""Plan-and-Solve: one plan until something calls for another, present in every prompt, with the failures; both modes."""
+"""Plan-and-Solve: one plan until something calls for another, in every prompt, told of failures; both modes."""
 
 from __future__ import annotations
 

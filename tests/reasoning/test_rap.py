@@ -102,7 +102,7 @@ def test_counting_samples_stands_in_for_scores() -> None:
 
 def test_without_scores_it_is_refused_or_counts_samples() -> None:
     offers = frozenset({"n", "choices"})
-    with pytest.raises(SpecError, match="needs score.*set `evaluation: samples`"):
+    with pytest.raises(SpecError, match=r"needs score.*set `evaluation: samples`"):
         AgentSpec.from_data({"reasoning": "rap"}).check(offers, "backend x")
     AgentSpec.from_data({"reasoning": {"name": "rap", "evaluation": "samples"}}).check(offers, "backend x")
 

@@ -296,6 +296,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "seconds": last.seconds,
             "native_action": last.call,
             "metrics": metrics,
+            "rules": self.rules.name,
             "state_hash": state_hash(view),
         }
         if self._terminated or self._truncated:

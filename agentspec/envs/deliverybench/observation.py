@@ -69,6 +69,8 @@ def _rules_of_thumb(rules: Rules) -> str:
         f"Charging adds {rules.charge_per_min:g} %/min (${rules.charge_price:.2f} per %), resting "
         f"{rules.rest_per_min:g} %/min.",
     ]
+    if not rules.ride_with_food_in_hand:
+        lines.append("No vehicle moves while you hold food in your hands: put it into the bag first.")
     return "\n".join(f"- {line}" for line in lines)
 
 

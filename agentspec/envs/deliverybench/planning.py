@@ -95,7 +95,7 @@ class Planner:
 
     def worth(self, start: Point, stops: Sequence[Stop], spent: int = 0) -> Worth:
         """The worth of driving `stops` in order, starting now at `start`, after `spent` other actions."""
-        return self._value(self._drive(self._begin(start, spent), stops))
+        return self._worth(self._drive(self._begin(start, spent), stops))
 
     def insert(self, start: Point, stops: Sequence[Stop], job: Job, spent: int = 0) -> tuple[Worth, list[Stop]]:
         """The best round with the stops of `job` added, the others keeping their sequence."""
@@ -103,20 +103,21 @@ class Planner:
         drop = Stop(job.id, DROPOFF, job.dropoff)
         pick = [] if job.picked else [Stop(job.id, PICKUP, job.pickup)]
         before = self._begin(start, spent)
-        best, at = Worth(-math.inf, 0.0, 0.0, 0.0), (0, 0)
+        most, best, at = -math.inf, before, (0, 0)
         for i in range(len(stops) + 1):
             # Candidates with the pick-up at i share the way up to it, and each next one the way up to its drop-off.
             now = self._drive(before, pick)
             for j in range(i, len(stops) + 1):
-                worth = self._value(self._drive(now, (drop, *stops[j:])))
-                if worth.value > best.value:
-                    best, at = worth, (i, j)
+                end = self._drive(now, (drop, *stops[j:]))
+                value = self._value(end)
+                if value > most:
+                    most, best, at = value, end, (i, j)
                 if not pick or j == len(stops):
                     break
                 now = self._drive(now, stops[j : j + 1])
             before = self._drive(before, stops[i : i + 1])
         i, j = at
-        return best, [*stops[:i], *pick, *stops[i:j], drop, *stops[j:]]
+        return self._worth(best), [*stops[:i], *pick, *stops[i:j], drop, *stops[j:]]
 
     def _begin(self, start: Point, spent: int) -> Progress:
         return (start, self.delay, 0.0, 0.0, 0.0, spent)
@@ -143,10 +144,14 @@ class Planner:
                 income += payment(job.pay, job.elapsed + now, job.limit)
         return here, now, way, idle, income, actions
 
-    def _value(self, progress: Progress) -> Worth:
+    def _value(self, progress: Progress) -> float:
         _, now, way, idle, income, actions = progress
         time = self.second * (now - idle) + self.idle * idle
-        return Worth(income - time - self.metre * way - self.call * actions, now, way, income)
+        return income - time - self.metre * way - self.call * actions
+
+    def _worth(self, progress: Progress) -> Worth:
+        _, now, way, _, income, _ = progress
+        return Worth(self._value(progress), now, way, income)
 
     def improve(self, start: Point, stops: Sequence[Stop], rounds: int = 2) -> tuple[Worth, list[Stop]]:
         """Take each order out and put it back at its best place until nothing gains, at most `rounds` times."""

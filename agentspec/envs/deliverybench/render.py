@@ -7,7 +7,7 @@ frame copies it, draws the moving parts and halves the size, which smooths every
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -25,6 +25,7 @@ HEIGHT, WIDTH = 480, 720
 MAP = 480
 SCALE = 2
 MARGIN_PX = 14
+PIN_IDS = 3
 ROAD_CM, PAVEMENT_CM = 2000.0, 3600.0
 
 Point = tuple[float, float]
@@ -94,8 +95,7 @@ def render(world: World, route_walked: Sequence[Step] = ()) -> npt.NDArray[np.ui
     picture = base.copy()
     draw = ImageDraw.Draw(picture)
     _draw_way(draw, frame, world.city, route_walked)
-    for order in world.state.orders.values():
-        _draw_order(draw, frame, order)
+    _draw_orders(draw, frame, world.state.orders.values())
     _draw_courier(draw, frame, world)
     result = Image.new("RGB", (WIDTH, HEIGHT), WHITE)
     result.paste(picture.reduce(SCALE), (0, 0))
@@ -190,25 +190,33 @@ def _draw_way(draw: ImageDraw.ImageDraw, frame: Frame, city: City, steps: Sequen
         _dot(draw, frame(steps[0][1]), 3 * SCALE, SOFT)
 
 
-def _draw_order(draw: ImageDraw.ImageDraw, frame: Frame, order: OrderState) -> None:
-    offer = order.offer
-    if order.picked is None:
-        draw.line(
-            [frame(offer.pickup.anchor), frame(offer.dropoff.anchor)],
-            fill=_blend(GROUND, PICKUP_COLOR, 0.5),
-            width=SCALE,
-        )
-        _pin(draw, frame(offer.pickup.anchor), PICKUP_COLOR, str(offer.id))
-    _pin(draw, frame(offer.dropoff.anchor), DROPOFF_COLOR, str(offer.id))
+def _draw_orders(draw: ImageDraw.ImageDraw, frame: Frame, orders: Iterable[OrderState]) -> None:
+    """A pin at every pick-up and drop-off; orders of one restaurant or door share theirs."""
+    pins: dict[tuple[Point, Color], list[int]] = {}
+    for order in orders:
+        offer = order.offer
+        if order.picked is None:
+            ends = [frame(offer.pickup.anchor), frame(offer.dropoff.anchor)]
+            draw.line(ends, fill=_blend(GROUND, PICKUP_COLOR, 0.5), width=SCALE)
+            pins.setdefault((offer.pickup.anchor, PICKUP_COLOR), []).append(offer.id)
+        pins.setdefault((offer.dropoff.anchor, DROPOFF_COLOR), []).append(offer.id)
+    for (place, color), numbers in pins.items():
+        shown = " ".join(str(n) for n in sorted(numbers)[:PIN_IDS])
+        _pin(draw, frame(place), color, shown + (f" +{len(numbers) - PIN_IDS}" if len(numbers) > PIN_IDS else ""))
 
 
 def _pin(draw: ImageDraw.ImageDraw, tip: Point, color: Color, text: str) -> None:
+    """A pin with its point at `tip` and a head as wide as the text, kept inside the map."""
     x, y = tip
     r = 8 * SCALE
-    top = y - 2.1 * r
-    draw.polygon([(x, y), (x - 0.8 * r, top + 0.5 * r), (x + 0.8 * r, top + 0.5 * r)], fill=color)
-    draw.ellipse([x - r, top - r, x + r, top + r], fill=color, outline=WHITE, width=SCALE)
-    draw.text((x, top), text, fill=WHITE, anchor="mm", font=_font(8 * SCALE))
+    half = max(float(r), draw.textlength(text, font=_font(8 * SCALE)) / 2.0 + 4 * SCALE)
+    middle = min(max(x, half + SCALE), MAP * SCALE - half - SCALE)
+    top = y - 2.1 * r if y > 3.2 * r else y + 2.1 * r
+    base = top + 0.5 * r if top < y else top - 0.5 * r
+    draw.polygon([(x, y), (x - 0.8 * r, base), (x + 0.8 * r, base)], fill=color)
+    head = [middle - half, top - r, middle + half, top + r]
+    draw.rounded_rectangle(head, radius=r, fill=color, outline=WHITE, width=SCALE)
+    draw.text((middle, top), text, fill=WHITE, anchor="mm", font=_font(8 * SCALE))
 
 
 def _draw_courier(draw: ImageDraw.ImageDraw, frame: Frame, world: World) -> None:
@@ -276,7 +284,8 @@ def _order_row(draw: ImageDraw.ImageDraw, top: int, world: World, order: OrderSt
     status = ("in hand" if order.pending else "in bag") if picked else ("ready" if elapsed >= offer.prep else "cooking")
     draw.text((MAP + 44, top + 2), f"{status}, ${offer.pay:.2f}", fill=INK, font=_font(11))
     late = (206, 62, 92) if left_s < 0 else SOFT
-    draw.text((WIDTH - 14, top + 2), f"{math.ceil(left_s / 60.0)} min", fill=late, anchor="ra", font=_font(11))
+    left = f"{math.ceil(abs(left_s) / 60.0)} min{' late' if left_s < 0 else ''}"
+    draw.text((WIDTH - 14, top + 2), left, fill=late, anchor="ra", font=_font(11))
 
 
 def _legend(draw: ImageDraw.ImageDraw) -> None:

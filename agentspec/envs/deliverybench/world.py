@@ -237,8 +237,10 @@ class World:
         return self.state.tick / self.rules.ticks_per_second
 
     def summary(self) -> dict[str, Any]:
-        """Run report and evaluation figures so far (JSON values)."""
-        return report(self.look(), self.recorder, self.shift_hours, self.rules.initial_balance)
+        """Run report and evaluation figures so far (JSON values), with city, rule set and seed they belong to."""
+        result = report(self.look(), self.recorder, self.shift_hours, self.rules.initial_balance)
+        result["meta"] |= {"city": self.city.name, "rules": self.rules.name, "seed": self.seed}
+        return result
 
     def evaluation(self) -> dict[str, float | None]:
         """The evaluation figures alone (cheap)."""

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import random
 import re
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import agentspec.envs
 from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.types import ActionSchema
+from tests.envs.deliverybench.fuzz import hostile_text
 
 ID = "agentspec/DeliveryBench-v0"
 KEYS = {
     "instruction", "action_schema", "state", "balance", "net_earnings", "error", "error_code", "message", "invalid",
-    "events", "seconds", "native_action", "metrics", "state_hash",
+    "events", "seconds", "native_action", "metrics", "rules", "state_hash",
 }  # fmt: skip
 
 
@@ -75,7 +79,8 @@ def test_max_steps_truncates() -> None:
     env.reset(seed=0)
     assert env.step("VIEW_ORDERS()")[2:4] == (False, False)
     *_, terminated, truncated, info = env.step("VIEW_ORDERS()")
-    assert truncated and not terminated and "report" in info and info["state"]["calls_left"] == 0
+    assert info["rules"] == "fair" and info["report"]["meta"]["rules"] == "fair"
+    assert truncated and not terminated and info["state"]["calls_left"] == 0
 
 
 def test_original_rules_end_after_200_actions_and_fair_ones_do_not() -> None:
@@ -178,6 +183,44 @@ def test_snapshot_is_exact(mode: str) -> None:
     other.restore(blob)
     other.observe()
     assert play(other) == first
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.integers(0, 40),
+    st.sampled_from(["native", "menu"]),
+    st.sampled_from(["fair", "original"]),
+)
+def test_restoring_is_an_identity_under_random_play(seed: int, steps: int, mode: str, rules: str) -> None:
+    env = tiny(action_mode=mode, rules=rules, think_time={"call": 1.0})
+    rng = random.Random(seed)
+
+    def play(target: DeliveryBenchEnv, dice: random.Random, count: int) -> list:
+        rows = []
+        for _ in range(count):
+            courier = RandomCourier(dice)
+            text = hostile_text(dice) if dice.random() < 0.2 else courier.act(target.observe()[1])
+            if dice.random() < 0.2:
+                target.deliberate(dice.randrange(3), 10)
+            observation, reward, terminated, truncated, info = target.step(text)
+            rows.append((observation, reward, terminated, truncated, strip(info)))
+        return rows
+
+    env.reset(seed=seed)
+    play(env, rng, steps)
+    blob, here = env.snapshot(), env.observe()
+    first = play(env, random.Random(seed + 1), 15)
+    after = env.snapshot()
+    other = tiny(action_mode=mode, rules=rules, think_time={"call": 1.0})
+    other.reset(seed=seed + 7)
+    for target in (env, other):
+        target.restore(blob)
+        assert target.snapshot() == blob
+        again = target.observe()
+        assert again[0] == here[0] and strip(again[1]) == strip(here[1])
+        assert play(target, random.Random(seed + 1), 15) == first
+        assert target.snapshot() == after
 
 
 @pytest.mark.parametrize(

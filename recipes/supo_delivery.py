@@ -1,0 +1,23 @@
+"""SUPO on DeliveryBench: GRPO with trained summaries every eight actions.
+
+    accelerate launch recipes/supo_delivery.py --config recipes/configs/supo_cpu.yaml
+
+The same trainer as ``grpo_delivery.py``; the scaffold's memory replaces the conversation by the policy's own summary,
+and the summary's tokens are trained with the rollout's advantage.
+"""
+
+from __future__ import annotations
+
+from recipes.common import draw_curve, parse_config, run_recipe, train
+
+
+def main() -> None:
+    """Train with summaries, save the adapter, draw the reward curve."""
+    from trainers.supo import as_supo
+
+    config = as_supo(parse_config(default="supo_cpu.yaml"))
+    draw_curve(config, train(config))
+
+
+if __name__ == "__main__":
+    run_recipe(main)
