@@ -263,10 +263,17 @@ async def _step(
     task: Task, agent: Agent, env: Any, worker: EnvWorker, observation: Any, info: dict[str, Any]
 ) -> tuple[Transition | None, Any, dict[str, Any]]:
     """Decide and act once; no transition when the budget is exhausted."""
+    before = len(agent.recorder.calls)
     agent_input, decision = await agent.decide(task, observation, info)
     if "budget" in decision.trace:
         return None, observation, info
     text = decision.action.text
+    deliberate = getattr(getattr(env, "unwrapped", env), "deliberate", None)
+    if callable(deliberate):
+        # Environments that charge for thinking are told what the decision took.
+        calls = agent.recorder.calls[before:]
+        tokens = sum(call.usage.output_tokens for call in calls)
+        await worker.call("deliberate", lambda: deliberate(len(calls), tokens))
     observation, reward, terminated, truncated, info = await worker.call("step", lambda: env.step(text))
     if not math.isfinite(float(reward)):
         raise EnvironmentFailedError(f"step returned reward {reward} for action {text!r}; rewards must be finite")

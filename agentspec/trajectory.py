@@ -160,6 +160,9 @@ def replay(trajectory: Trajectory, make_env: Callable[[Task], Any]) -> list[str]
         observation, info = env.reset(seed=trajectory.task.seed)
         for t in trajectory.transitions:
             compare(f"step {t.step} observation", t.input.text, observation["text"])
+            deliberate = getattr(getattr(env, "unwrapped", env), "deliberate", None)
+            if callable(deliberate) and "thought" in t.info:
+                deliberate(*t.info["thought"])
             observation, reward, terminated, _, info = env.step(t.action_text)
             if not math.isclose(t.reward, float(reward), rel_tol=0, abs_tol=1e-12):
                 compare(f"step {t.step} reward", t.reward, float(reward))

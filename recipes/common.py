@@ -74,7 +74,6 @@ def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
     if trainer.accelerator.is_main_process:
         for note in config.warnings():
             print(f"note: {note}", file=sys.stderr)
-        trainer.run_log.manifest(config=run_config(config), spec=config.spec.to_data(), resumed_from=last or "")
     if last:
         print(f"resuming from {last}", file=sys.stderr)
     trainer.train(resume_from_checkpoint=last)

@@ -23,9 +23,9 @@ def main() -> None:
 def train_warmup(config: Any) -> None:
     """Supervised training as ``config`` says: ``train_tasks`` demonstrations, ``num_train_epochs`` passes."""
     from datasets import Dataset
-    from trl import SFTConfig, SFTTrainer
+    from trl import SFTConfig
 
-    from trainers.demonstrations import demonstrate
+    from trainers.demonstrations import DemonstrationTrainer, demonstrate
     from trainers.policy import load_policy
     from trainers.rollouts import make_tasks
     from trainers.runlog import RunLog
@@ -53,7 +53,8 @@ def train_warmup(config: Any) -> None:
         gradient_checkpointing=config.gradient_checkpointing,
         seed=config.seed,
     )
-    trainer = SFTTrainer(model, args, train_dataset=Dataset.from_list(shown.rows), processing_class=tokenizer)
+    data = Dataset.from_list(shown.rows)
+    trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()
     trainer.save_model(config.output_dir)
     log = RunLog(Path(config.output_dir))

@@ -1,4 +1,4 @@
-"""Episodes: many at once without influence on each other, failures that stay local, replay, budgets (invariants 7, 8)."""
+"""Invariants 7 and 8: many episodes without influence on each other, failures that stay local, replay, budgets."""
 
 from __future__ import annotations
 

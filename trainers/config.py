@@ -169,28 +169,37 @@ class ScaffoldConfig(GRPOConfig):
         Raises:
             SpecError: what was given, why it cannot work, what to do.
         """
-        spec = self.spec
         _ = self.reward_set, self.world
-        known = (*ESTIMATORS, *STEP_ESTIMATORS)
-        if self.estimator not in known:
-            raise SpecError(f"unknown estimator {self.estimator!r}{suggest(self.estimator, known)}")
-        if self.overlong not in ("mask", "keep", "drop"):
-            raise SpecError(f"overlong must be 'mask', 'keep' or 'drop', got {self.overlong!r}")
-        for end in self.overlong_ends:
-            if end not in ENDS:
-                raise SpecError(f"unknown end {end!r} in overlong_ends{suggest(end, ENDS)}")
-        if self.memory_carry not in ("first", "best"):
-            raise SpecError(f"memory_carry must be 'first' or 'best', got {self.memory_carry!r}")
-        if self.packing not in ("tree", "padded"):
-            raise SpecError(f"packing must be 'tree' or 'padded', got {self.packing!r}")
-        for credit in self.train_credits:
-            if credit not in ("executed", "explored", "aux"):
-                raise SpecError(f"unknown credit {credit!r}; known: executed, explored, aux")
-        missing = unmatched_patterns(call_paths(spec), self.train_filter)
+        self._check_names()
+        self._check_calls()
+        self._check_exact()
+
+    def _check_names(self) -> None:
+        """Every name among its alternatives."""
+        estimators = (*ESTIMATORS, *STEP_ESTIMATORS)
+        for name, known in (
+            ("estimator", estimators),
+            ("overlong", ("mask", "keep", "drop")),
+            ("memory_carry", ("first", "best")),
+            ("packing", ("tree", "padded")),
+        ):
+            value = getattr(self, name)
+            if value not in known:
+                raise SpecError(f"unknown {name} {value!r}{suggest(value, known)}")
+        for name, known in (("overlong_ends", ENDS), ("train_credits", ("executed", "explored", "aux"))):
+            for value in getattr(self, name):
+                if value not in known:
+                    raise SpecError(f"unknown {value!r} in {name}{suggest(value, known)}")
+
+    def _check_calls(self) -> None:
+        """Something is trained, and sampled so that it can be."""
+        spec = self.spec
+        paths = call_paths(spec)
+        missing = unmatched_patterns(paths, self.train_filter)
         if missing:
             raise SpecError(
                 f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
-                f"come from {', '.join(sorted(set(call_paths(spec))))}"
+                f"come from {', '.join(sorted(set(paths))) or 'no module (none calls the model)'}"
             )
         if spec.sampling.temperature <= 0:
             raise SpecError("agent.sampling.temperature is 0: greedy choices have no gradient; set it above 0")
@@ -199,6 +208,9 @@ class ScaffoldConfig(GRPOConfig):
                 "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full "
                 "distribution and would not match the sampled ones; train with top_p 1 and top_k 0"
             )
+
+    def _check_exact(self) -> None:
+        """Nothing of TRL's that speaks of rows where this trainer speaks of episodes."""
         if self.loss_type in REFUSED_LOSSES:
             raise SpecError(
                 f"loss_type {self.loss_type!r} is not offered: {REFUSED_LOSSES[self.loss_type]}; "

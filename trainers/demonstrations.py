@@ -1,4 +1,8 @@
-"""Expert episodes -> rows for a supervised warm start, in the layout that the policy will meet."""
+"""Expert episodes -> a supervised warm start, in the layout that the policy will meet.
+
+Few tokens of a row are the expert's: a dozen short actions among thousands of tokens of prompts and observations. So
+TRL's ``SFTTrainer`` gets its loss from the packed forward, which computes logits only where a token is trained.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
+from torch import nn
+from trl import SFTTrainer
+
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.demonstration import DemonstrationLLM
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from trainers.sequences import TrainFilter, build_sequences
+from trainers.batches import Row, rows_logprobs
+from trainers.sequences import TokenSequence, TrainFilter, build_sequences
+from trainers.tree import enable_tree
 
 
 @dataclass(frozen=True)
@@ -53,3 +63,37 @@ def demonstrate(
         for s in build_sequences(episode, TrainFilter())
     ]
     return Demonstrations(rows, episodes)
+
+
+class DemonstrationTrainer(SFTTrainer):
+    """``SFTTrainer`` whose forward is packed; the loss is the same mean negative log-likelihood of labelled tokens."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        enable_tree(self.accelerator.unwrap_model(self.model))
+
+    def compute_loss(
+        self,
+        model: nn.Module,
+        inputs: dict[str, torch.Tensor],
+        return_outputs: bool = False,
+        num_items_in_batch: torch.Tensor | int | None = None,
+    ) -> torch.Tensor:
+        """Mean over the labelled tokens of the (accumulated) batch."""
+        rows = [Row(_labelled(ids, labels), 1.0, i) for i, (ids, labels) in enumerate(_pairs(inputs))]
+        logps, _ = rows_logprobs(model, rows, packing="tree")
+        count = num_items_in_batch if num_items_in_batch is not None else sum(r.sequence.trained for r in rows)
+        return -logps.sum() / count
+
+
+def _pairs(inputs: dict[str, torch.Tensor]) -> list[tuple[list[int], list[int]]]:
+    """Ids and labels of each row, padding removed."""
+    rows = zip(inputs["input_ids"], inputs["labels"], inputs["attention_mask"], strict=True)
+    return [(ids[m.bool()].tolist(), labels[m.bool()].tolist()) for ids, labels, m in rows]
+
+
+def _labelled(ids: list[int], labels: list[int]) -> TokenSequence:
+    sequence = TokenSequence()
+    sequence.extend_context(ids)
+    sequence.mask = [0] + [int(label >= 0) for label in labels[1:]]
+    return sequence

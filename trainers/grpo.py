@@ -63,6 +63,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         self._episodes: list[Trajectory] = []
         self._current: dict[str, Any] | None = None
         self._buffered_inputs: Any = None
+        self._last_loaded_step = -1
         super().__init__(
             model=model,
             args=args,
@@ -81,6 +82,13 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         self._round = 0
         self._memory: bytes | None = None
 
+    def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
+        """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command)."""
+        if self.accelerator.is_main_process:
+            config, spec = self.args.to_dict(), self.args.spec.to_data()
+            self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
+        return super().train(resume_from_checkpoint=resume_from_checkpoint, **kwargs)
+
     @property
     def last_episodes(self) -> list[Trajectory]:
         """This rank's episodes of the last generation round."""
@@ -91,6 +99,12 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
     @property
     def llm(self) -> LLM:
         """The backend that samples from the live policy."""
+        if self._llm is None and self.use_vllm:
+            from agentspec.llm.vllm import VLLMBackend, colocated, server
+
+            engine = (server if self.vllm_mode == "server" else colocated)(self.vllm_generation)
+            length = self.args.vllm_max_model_length or self.model.config.max_position_embeddings
+            self._llm = VLLMBackend(engine, self.processing_class, max_context=length)
         if self._llm is None:
             self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
         return self._llm
@@ -129,9 +143,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             timeout_s=self.args.env_timeout_s,
             policy=f"step-{self.state.global_step}",
         )
-        invalidate = getattr(self.llm, "invalidate", None)
-        if invalidate is not None:
-            invalidate()
+        self._sync_weights()
         self._episodes = collect(runner, jobs, retries=self.args.retries)
         self._log_episodes(mode)
         if mode == "train":
@@ -140,6 +152,17 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         completions = [[{"role": "assistant", "content": _transcript(t)}] for t in self._episodes]
         n = len(self._episodes)
         return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
+
+    def _sync_weights(self) -> None:
+        """Make the backend sample from the weights as they are now."""
+        if self.use_vllm:
+            if self.state.global_step != self._last_loaded_step:
+                self.vllm_generation.sync_weights()
+                self._last_loaded_step = self.state.global_step
+            return
+        invalidate = getattr(self.llm, "invalidate", None)
+        if invalidate is not None:
+            invalidate()
 
     def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
         self._task_rows = inputs
@@ -326,7 +349,8 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         super().log(logs, start_time)
-        if self.accelerator.is_main_process and self.model.training:
+        summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
+        if self.accelerator.is_main_process and self.model.training and not summary:
             self.run_log.append("metrics.jsonl", {"step": self.state.global_step, **logs})
 
 

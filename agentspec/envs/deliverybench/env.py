@@ -145,7 +145,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         self._world = World(self.city, self.rules, orders, self.shift_hours)
         self._cards = OfferCards(self._world.book)
         self._steps = 0
-        self._thought: list[int] | None = None
+        self._thought: tuple[int, int] | None = None
         self._last = _Last()
         self._track: list[list[float | str]] = [[self._world.state.mode, *self._world.state.position]]
         return self.observe()
@@ -160,7 +160,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         """
         if calls < 0 or tokens < 0:
             raise ValueError(f"got {calls} calls and {tokens} tokens; expected numbers of at least 0")
-        self._thought = [int(calls), int(tokens)]
+        self._thought = (int(calls), int(tokens))
 
     def step(self, action: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one action given as text; no text raises. After the end nothing happens any more."""
@@ -170,12 +170,10 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         before = Progress.of(world)
         balance = world.state.balance
         mode = world.state.mode
-        calls, tokens = self._thought or (1, 0)
-        thought = self.think_time.seconds(calls, tokens)
-        outcome = world.step(call, thought)
-        self._thought = None
+        thought, self._thought = self._thought or (1, 0), None
+        outcome = world.step(call, self.think_time.seconds(*thought))
         self._steps += 1
-        self._last = _Last.of(outcome, call, problem, events_since(before, world, outcome))
+        self._last = _Last.of(outcome, call, problem, events_since(before, world, outcome), thought)
         if world.state.position != tuple(self._track[-1][1:]):
             self._track.append([mode, *world.state.position])
         observation, info = self.observe()
@@ -233,7 +231,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             state = json.loads(blob)
             version, seed = state["version"], state["seed"]
             blob, steps, last, track = state["world"].encode("utf-8"), state["steps"], state["last"], state["track"]
-            thought = state["thought"]
+            thought = None if state["thought"] is None else tuple(state["thought"])
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"these bytes are no snapshot of a DeliveryBench environment ({error!r})") from error
         if version != SNAPSHOT_VERSION:
@@ -294,6 +292,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "invalid": last.invalid,
             "events": list(last.events),
             "seconds": last.seconds,
+            "thought": list(last.thought),
             "native_action": last.call,
             "metrics": metrics,
             "rules": self.rules.name,
@@ -314,7 +313,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
 class _Last:
     """What the last step left for the next observation."""
 
-    __slots__ = ("call", "code", "error", "events", "invalid", "message", "seconds")
+    __slots__ = ("call", "code", "error", "events", "invalid", "message", "seconds", "thought")
 
     def __init__(
         self,
@@ -325,6 +324,7 @@ class _Last:
         invalid: bool = False,
         seconds: float = 0.0,
         events: list[str] | None = None,
+        thought: tuple[int, int] = (0, 0),
     ) -> None:
         self.call = call
         self.code = code
@@ -333,9 +333,10 @@ class _Last:
         self.invalid = invalid
         self.seconds = seconds
         self.events = events or []
+        self.thought = thought
 
     @classmethod
-    def of(cls, outcome: Outcome, call: str, problem: str, events: list[str]) -> _Last:
+    def of(cls, outcome: Outcome, call: str, problem: str, events: list[str], thought: tuple[int, int]) -> _Last:
         """From a step's outcome; `problem` replaces the message of an answer that is no choice of the menu."""
         message = problem or outcome.message
         for settled in outcome.settlements:
@@ -349,6 +350,7 @@ class _Last:
             invalid=failed,
             seconds=outcome.seconds,
             events=events,
+            thought=thought,
         )
 
     def dump(self) -> dict[str, Any]:

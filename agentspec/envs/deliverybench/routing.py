@@ -27,7 +27,7 @@ __all__ = ["DistanceField", "Graph", "Network", "Router", "Snap", "SnapIndex", "
 CELL_CM = 2500.0
 FAR_CM = 1e8
 MEMO_LIMIT = 65536
-FIELD_LIMIT = 8192
+FIELD_LIMIT = 2048
 # Two ways count as equally short when they differ by less than the rounding of coordinates can explain.
 DETOUR_CM = 1e-3
 

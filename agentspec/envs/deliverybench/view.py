@@ -188,12 +188,14 @@ def _nearest(world: World, field: DistanceField) -> dict[str, Any]:
     """The nearest place of each service kind by way: name, position, metres."""
     known: dict[str, Card] | None = field.memo.get("nearest")
     if known is None:
-        known = field.memo["nearest"] = {}
+        known = {}
         for kind in SERVICES:
             places = world.city.pois_of(kind)
             if places:
                 poi = min(places, key=field.to)
                 known[kind] = {"name": poi.name, "xy": metres(poi.anchor), "m": way(field, poi)}
+        # Stored when complete: worlds in other threads read it.
+        field.memo["nearest"] = known
     return {kind: {**card} for kind, card in known.items()}
 
 

@@ -52,6 +52,12 @@ def test_statistics_of_a_city() -> None:
     assert len(city_statistics.table([row]).splitlines()) == 7  # two tables of three lines, and an empty one
 
 
+def test_speed_benchmark_generates_a_city_where_no_map_is(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(deliverybench, "REFERENCE_MAPS", tmp_path / "none")
+    folder, name = deliverybench.city_folder(None, tmp_path)
+    assert (folder / "roads.json").is_file() and "generated" in name
+
+
 def test_speed_benchmark_has_its_figures(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(deliverybench, "STEPS", 200)
     folder = write_city(tmp_path / "tiny-0", "tiny", 0)

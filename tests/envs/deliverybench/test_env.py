@@ -22,6 +22,7 @@ ID = "agentspec/DeliveryBench-v0"
 KEYS = {
     "instruction", "action_schema", "state", "balance", "net_earnings", "error", "error_code", "message", "invalid",
     "events", "seconds", "native_action", "metrics", "rules", "state_hash",
+    "thought",
 }  # fmt: skip
 
 
@@ -137,7 +138,8 @@ def test_thinking_is_free_or_charged_by_call_and_token() -> None:
     assert priced.step("WAIT(10)")[4]["seconds"] == 12.0
     priced.deliberate(3, 40)
     blob = priced.snapshot()
-    assert priced.step("WAIT(10)")[4]["seconds"] == 18.0
+    *_, info = priced.step("WAIT(10)")
+    assert info["seconds"] == 18.0 and info["thought"] == [3, 40]
     priced.restore(blob)
     assert priced.step("WAIT(10)")[4]["seconds"] == 18.0
     priced.deliberate(0, 0)
@@ -185,6 +187,7 @@ def test_snapshot_is_exact(mode: str) -> None:
     assert play(other) == first
 
 
+@pytest.mark.filterwarnings("ignore::SyntaxWarning")
 @settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 10**6),
