@@ -300,8 +300,16 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         state = ScaffoldState(self._step, self._round, buffered, self._memory)
         save_state(folder, state, self.accelerator.process_index)
 
+    def _get_train_sampler(self, dataset: Any = None) -> Any:
+        self._task_sampler = super()._get_train_sampler(dataset)
+        return self._task_sampler
+
     def _load_optimizer_and_scheduler(self, checkpoint: str | None) -> None:
         super()._load_optimizer_and_scheduler(checkpoint)
+        if checkpoint and self._task_sampler.shuffle:
+            # The sampler draws one order of tasks per epoch; those of finished epochs were drawn before the stop.
+            for _ in range(int((self.state.epoch or 0.0) + 1e-6)):
+                torch.randperm(self._task_sampler.num_samples, generator=self._task_sampler.generator)
         state = load_state(checkpoint, self.accelerator.process_index) if checkpoint else None
         if state is None:
             return

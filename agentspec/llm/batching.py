@@ -53,12 +53,14 @@ class Batcher(Generic[T]):
 
     def enter(self, episode: str) -> None:
         """The episode goes live. An episode may enter more than once and then leaves as often."""
-        self._live[episode] = self._live.get(episode, 0) + 1
         try:
             task = asyncio.current_task()
         except RuntimeError:  # no loop runs: the caller will leave by itself
-            return
-        self._adopt_loop()
+            task = None
+        else:
+            # Before the episode is counted: a new loop forgets the live episodes of the one before.
+            self._adopt_loop()
+        self._live[episode] = self._live.get(episode, 0) + 1
         if task is not None:
             task.add_done_callback(partial(self._task_ended, episode, self._live))
 

@@ -45,8 +45,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         "n_generate_sample": 5,
         "root_samples": 10,
         "rollout": "simulate",
+        "prediction_tokens": 128,
     },
-    "rl": {"num_iterations": 4, "max_depth": 3, "n_generate_sample": 3, "root_samples": 3, "rollout": "value"},
+    "rl": {
+        "num_iterations": 4,
+        "max_depth": 3,
+        "n_generate_sample": 3,
+        "root_samples": 3,
+        "rollout": "value",
+        "prediction_tokens": 48,
+    },
 }
 NEXT_FREE = "Write one sentence after 'Thought:' about what matters now, then one line 'Action: NAME(arguments)'."
 NEXT_MENU = "Answer with the one action that should come next, word for word."
@@ -114,7 +122,7 @@ class LanguageAgentTreeSearch:
         memory_tokens: int = 512,
         path_tokens: int = 512,
         lesson_tokens: int = 192,
-        prediction_tokens: int = 128,
+        prediction_tokens: int | None = None,
         thought_tokens: int | None = None,
     ) -> None:
         given: dict[str, Any] = {
@@ -123,6 +131,7 @@ class LanguageAgentTreeSearch:
             "n_generate_sample": n_generate_sample,
             "root_samples": root_samples,
             "rollout": rollout,
+            "prediction_tokens": prediction_tokens,
         }
         chosen: dict[str, Any] = settings("lats", PRESETS, preset, given)
         self.rollout: str = chosen.pop("rollout")
@@ -141,7 +150,7 @@ class LanguageAgentTreeSearch:
         self.temperature = temperature
         self.limits = {"calls": max_calls, "tokens": max_search_tokens}
         self.memory_tokens, self.path_tokens, self.lesson_tokens = memory_tokens, path_tokens, lesson_tokens
-        self.prediction_tokens = prediction_tokens
+        self.prediction_tokens: int = chosen["prediction_tokens"]
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self._lessons: list[str] = []
 

@@ -38,8 +38,8 @@ from agentspec.reasoning.search.world import ModelWorld, render_steps, root_outc
 from agentspec.types import ActionSchema, AgentInput, Decision, Recall
 
 PRESETS = {
-    "paper": {"num_iterations": 10, "depth": 5, "num_actions": 4},
-    "rl": {"num_iterations": 3, "depth": 3, "num_actions": 3},
+    "paper": {"num_iterations": 10, "depth": 5, "num_actions": 4, "prediction_tokens": 128},
+    "rl": {"num_iterations": 3, "depth": 3, "num_actions": 3, "prediction_tokens": 48},
 }
 NEXT = "{steps}Write the one action that should come next."
 JUDGE = "{steps}The next action would be: {action}\nIs that a good step towards the task's goal? Answer good or bad."
@@ -121,7 +121,7 @@ class ReasoningViaPlanning(Stateless):
     """Monte-Carlo tree search in the model's imagination.
 
     Args:
-        preset: ``paper`` (10 iterations, depth 5, 4 actions) or ``rl`` (3, 3, 3).
+        preset: ``paper`` (10 iterations, depth 5, 4 actions) or ``rl`` (3, 3, 3, short predictions).
         num_iterations: paths sampled per decision.
         depth: most steps of a path.
         num_actions: actions sampled per state.
@@ -158,10 +158,15 @@ class ReasoningViaPlanning(Stateless):
         max_search_tokens: int | None = None,
         memory_tokens: int = 512,
         path_tokens: int = 512,
-        prediction_tokens: int = 128,
+        prediction_tokens: int | None = None,
         thought_tokens: int | None = None,
     ) -> None:
-        given = {"num_iterations": num_iterations, "depth": depth, "num_actions": num_actions}
+        given = {
+            "num_iterations": num_iterations,
+            "depth": depth,
+            "num_actions": num_actions,
+            "prediction_tokens": prediction_tokens,
+        }
         chosen: dict[str, int] = settings("rap", PRESETS, preset, given)
         at_least("rap", 1, max_calls=max_calls, eval_samples=eval_samples, **chosen)
         one_of(
@@ -177,7 +182,8 @@ class ReasoningViaPlanning(Stateless):
         self.output = output
         self.temperature = temperature
         self.limits = {"calls": max_calls, "tokens": max_search_tokens}
-        self.memory_tokens, self.path_tokens, self.prediction_tokens = memory_tokens, path_tokens, prediction_tokens
+        self.memory_tokens, self.path_tokens = memory_tokens, path_tokens
+        self.prediction_tokens = chosen["prediction_tokens"]
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:

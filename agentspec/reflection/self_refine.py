@@ -34,7 +34,7 @@ from agentspec.reasoning.common import (
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task
 
-PRESETS = {"paper": {"max_iterations": 3}, "rl": {"max_iterations": 1}}
+PRESETS = {"paper": {"max_iterations": 3, "feedback_tokens": 96}, "rl": {"max_iterations": 1, "feedback_tokens": 48}}
 
 ATTEMPT = "Attempt {number}: {action}"
 FEEDBACK_ON = "Feedback on attempt {number}: {feedback}"
@@ -70,7 +70,7 @@ class SelfRefine:
     """Feedback and refinement of every decision.
 
     Args:
-        preset: ``paper`` (at most 3 iterations, as AgentSpec) or ``rl`` (1).
+        preset: ``paper`` (at most 3 iterations, as AgentSpec) or ``rl`` (1, short feedback).
         max_iterations: most pairs of feedback and refinement.
         feedback_tokens: most tokens of a feedback.
         history_tokens: budget of attempts and feedback in a prompt; the oldest go first.
@@ -82,15 +82,16 @@ class SelfRefine:
         services: Services,
         preset: str = "paper",
         max_iterations: int | None = None,
-        feedback_tokens: int = 96,
+        feedback_tokens: int | None = None,
         history_tokens: int = 512,
         memory_tokens: int = 256,
     ) -> None:
-        chosen = settings("self_refine", PRESETS, preset, {"max_iterations": max_iterations})
-        at_least("self_refine", 1, feedback_tokens=feedback_tokens, **chosen)
+        given = {"max_iterations": max_iterations, "feedback_tokens": feedback_tokens}
+        chosen: dict[str, int] = settings("self_refine", PRESETS, preset, given)
+        at_least("self_refine", 1, **chosen)
         self.services = services
-        self.max_iterations: int = chosen["max_iterations"]
-        self.feedback_tokens = feedback_tokens
+        self.max_iterations = chosen["max_iterations"]
+        self.feedback_tokens = chosen["feedback_tokens"]
         self.history_tokens = history_tokens
         self.memory_tokens = memory_tokens
 

@@ -181,3 +181,22 @@ def test_a_new_event_loop_starts_clean():
     run(abandoned())
     run(play(batcher, "a", 1))
     assert log.batches[-1] == ["a0"]
+
+
+def test_a_second_loop_waits_for_every_episode_again() -> None:
+    """The first episode that enters on a new event loop is as live as the others: one batch, not two."""
+    batches: list[list[str]] = []
+    batcher: Batcher[str] = Batcher(lambda jobs: batches.append(list(jobs)))
+
+    async def episode(name: str, delay: float) -> None:
+        batcher.enter(name)
+        await asyncio.sleep(delay)
+        await batcher.submit(name, 0, name)
+        batcher.leave(name)
+
+    async def play() -> None:
+        await asyncio.gather(episode("a", 0.0), episode("b", 0.05))
+
+    for _ in range(2):
+        asyncio.run(play())
+    assert batches == [["a", "b"], ["a", "b"]]
