@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 os.environ.setdefault("WANDB_MODE", "offline")
@@ -27,18 +27,26 @@ def parse_config(argv: Sequence[str] | None = None, default: str = "quickstart_c
     from agentspec.spec import load_yaml
     from trainers.config import ScaffoldConfig
 
+    class Parser(TrlParser):  # type: ignore[misc]  # TRL's parser has no types
+        """Says what is wrong in one line, without two hundred lines of usage."""
+
+        def error(self, message: str) -> NoReturn:
+            raise SpecError(f"{path}: {message}; `--help` lists every field")
+
     args = list(sys.argv[1:] if argv is None else argv)
     if "--config" not in args and not any(a.startswith("--config=") for a in args):
         args = ["--config", str(CONFIGS / default), *args]
     path = next((a.partition("=")[2] for a in args if a.startswith("--config=")), None)
-    path = path or args[args.index("--config") + 1]
+    path = path or next(iter(args[args.index("--config") + 1 :]), None)
+    if not path or path.startswith("--"):
+        raise SpecError("--config needs the path of a YAML file after it")
     data = load_yaml(Path(path))
     known = ScaffoldConfig.__dataclass_fields__
     for key in data:
         if key not in known:
             raise SpecError(f"{path}: unknown key {key!r}{suggest(str(key), known)}")
     try:
-        (config,) = TrlParser((ScaffoldConfig,)).parse_args_and_config(args=args)
+        (config,) = Parser((ScaffoldConfig,)).parse_args_and_config(args=args)
     except ValueError as error:
         raise SpecError(f"{path}: {error}") from error
     return config
@@ -47,19 +55,19 @@ def parse_config(argv: Sequence[str] | None = None, default: str = "quickstart_c
 def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
     """Train as ``config`` says; returns the trainer. The final model lies in ``config.output_dir``.
 
-    With ``config.resume`` the run continues from its last checkpoint.
+    With ``config.resume`` the run continues from its last complete checkpoint.
     """
     from datasets import Dataset
-    from transformers.trainer_utils import get_last_checkpoint
 
     from trainers.grpo import ScaffoldGRPOTrainer
     from trainers.policy import load_policy
     from trainers.report import TerminalReport
+    from trainers.resume import last_complete_checkpoint
     from trainers.rollouts import make_tasks, task_rows
 
     config.check()
     folder = Path(config.output_dir)
-    last = get_last_checkpoint(str(folder)) if config.resume and folder.is_dir() else None
+    last = last_complete_checkpoint(folder) if config.resume else None
     model, tokenizer = load_policy(config)
     name, options = config.world
     tasks = make_tasks(name, options, config.train_tasks)
@@ -76,7 +84,7 @@ def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
             print(f"note: {note}", file=sys.stderr)
     if last:
         print(f"resuming from {last}", file=sys.stderr)
-    trainer.train(resume_from_checkpoint=last)
+    trainer.train(resume_from_checkpoint=str(last) if last else None)
     trainer.save_model(str(folder))
     return trainer
 

@@ -14,6 +14,10 @@ from agentspec.trajectory import Trajectory
 Reward = Callable[[Trajectory], tuple[float, ...]]
 
 
+class NonFiniteRewardError(ValueError):
+    """An episode's reward is NaN or infinite: this episode cannot be scored, whatever the others do."""
+
+
 @dataclass(frozen=True)
 class RewardEntry:
     """A registered reward: where it lives and what it pays."""
@@ -56,7 +60,7 @@ class RewardSet:
         """Episode sum of each reward, unweighted; ``None`` if the episode is unscorable.
 
         Raises:
-            ValueError: a reward that is not finite.
+            NonFiniteRewardError: a reward that is not finite.
         """
         steps = self.steps(trajectory)
         return None if steps is None else {name: math.fsum(values) for name, values in steps.items()}
@@ -68,10 +72,15 @@ class RewardSet:
         result = {}
         for name, function in self._functions.items():
             values = function(trajectory)
-            if len(values) != len(trajectory.transitions) or not all(map(math.isfinite, values)):
+            if len(values) != len(trajectory.transitions):
                 raise ValueError(
-                    f"reward {name!r} gave {values} for {len(trajectory.transitions)} steps of episode "
-                    f"{trajectory.episode}; expected one finite number per step"
+                    f"reward {name!r} gave {len(values)} values for {len(trajectory.transitions)} steps of episode "
+                    f"{trajectory.episode}; expected one per step"
+                )
+            if not all(map(math.isfinite, values)):
+                raise NonFiniteRewardError(
+                    f"reward {name!r} is not finite in episode {trajectory.episode}: {values}; the environment "
+                    "reported a number that is none"
                 )
             result[name] = values
         return result

@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,7 +91,7 @@ def audit(run: str | Path, step: int | None = None) -> Iterator[Receipt]:
         raise SpecError(
             f"{folder} holds no training run: expected manifest.json and updates.jsonl; give the run's output_dir"
         )
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    manifest = _manifest(folder / "manifest.json")
     records = RunLog(folder).read("updates.jsonl")
     if step is not None:
         records = [r for r in records if r["round"] == step]
@@ -101,6 +102,21 @@ def audit(run: str | Path, step: int | None = None) -> Iterator[Receipt]:
     config = _config(manifest["config"])
     for record in records:
         yield _audit_update(folder, record, config)
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    """The run's manifest.
+
+    Raises:
+        SpecError: not the manifest of a training run.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise SpecError(f"{path} is not JSON ({error}); the run's record is damaged") from error
+    if not isinstance(data, dict) or not isinstance(data.get("config"), dict):
+        raise SpecError(f"{path} names no configuration: it is not the manifest of a training run")
+    return data
 
 
 def _config(data: dict[str, Any]) -> Any:
@@ -128,7 +144,10 @@ def _audit_update(folder: Path, record: dict[str, Any], config: Any) -> Receipt:
     episodes = [t for f in sorted(files, key=_rank) for t in read_trajectories(f)]
     receipt.episodes = len(episodes)
     receipt.unscorable = sum(not t.scorable for t in episodes)
-    _check_identity(episodes, record, receipt)
+    _check_identity(episodes, record, config, receipt)
+    if len(episodes) % config.num_generations:
+        receipt.violations.append(f"{len(episodes)} episodes are no whole groups of {config.num_generations}")
+        return receipt
     weighed = weigh(episodes, config, config.reward_set, group=config.num_generations)
     _check_rows(weighed.rows, episodes, record, receipt)
     _check_advantages(weighed.rows, episodes, config, receipt)
@@ -147,10 +166,15 @@ def _rank(path: Path) -> int:
     return int(path.stem.partition(".rank")[2] or 0)
 
 
-def _check_identity(episodes: Sequence[Trajectory], record: dict[str, Any], receipt: Receipt) -> None:
-    """The episodes are those of the receipt, played by the policy of this update."""
+def _check_identity(episodes: Sequence[Trajectory], record: dict[str, Any], config: Any, receipt: Receipt) -> None:
+    """The episodes are those of the receipt, with its returns, played by the policy of this update."""
     if [t.episode for t in episodes] != record["episodes"]:
         receipt.violations.append("the logged episodes are not those of the receipt")
+    else:
+        for trajectory, logged in zip(episodes, record["returns"], strict=True):
+            value = config.reward_set.total(trajectory)
+            if not _equal(value, logged):
+                receipt.violations.append(f"{trajectory.episode} returned {value}, but the receipt says {logged}")
     expected = f"step-{record['round']}"
     strangers = [t.episode for t in episodes if t.policy != expected]
     if strangers:
@@ -158,15 +182,34 @@ def _check_identity(episodes: Sequence[Trajectory], record: dict[str, Any], rece
 
 
 def _check_rows(rows: Sequence[Row], episodes: Sequence[Trajectory], record: dict[str, Any], receipt: Receipt) -> None:
-    """The rows rebuilt from the episodes are those the loss read."""
-    rebuilt = sorted(r["digest"] for r in receipt_rows(rows))
-    logged = sorted(r["digest"] for r in record["rows"])
-    if rebuilt != logged:
-        differing = len(set(rebuilt) ^ set(logged))
+    """The rows rebuilt from the episodes are those the loss read, and the receipt describes them truly."""
+    rebuilt = {(r["episode"], r["digest"]): r for r in receipt_rows(rows)}
+    mine = Counter((r["episode"], r["digest"]) for r in receipt_rows(rows))
+    theirs = Counter((r["episode"], r["digest"]) for r in record["rows"])
+    if mine != theirs:
+        differing = sum(((mine - theirs) + (theirs - mine)).values())
         receipt.violations.append(f"{differing} rows of the update are not what its episodes give")
     for row in record["rows"]:
-        if not episodes[row["episode"]].scorable:
-            receipt.violations.append(f"episode {row['episode']} could not be scored, yet has a row")
+        known = 0 <= row["episode"] < len(episodes)
+        if not known or not episodes[row["episode"]].scorable:
+            what = "could not be scored" if known else "does not exist"
+            receipt.violations.append(f"episode {row['episode']} {what}, yet has a row")
+        given = rebuilt.get((row["episode"], row["digest"]), row)
+        for name in ("tokens", "trained", "advantage"):
+            if not _equal(given[name], row[name]):
+                receipt.violations.append(
+                    f"a row of episode {row['episode']} has {name} {given[name]}, but the receipt says {row[name]}"
+                )
+
+
+def _equal(a: Any, b: Any) -> bool:
+    """Numbers, or lists of numbers, equal up to the tolerance; ``None`` equals itself only."""
+    if a is None or b is None:
+        return a is b
+    left, right = ([x] if isinstance(x, (int, float)) else list(x) for x in (a, b))
+    return len(left) == len(right) and all(
+        math.isclose(x, y, rel_tol=TOLERANCE, abs_tol=TOLERANCE) for x, y in zip(left, right, strict=True)
+    )
 
 
 def _check_advantages(rows: Sequence[Row], episodes: Sequence[Trajectory], config: Any, receipt: Receipt) -> None:

@@ -13,6 +13,7 @@ from typing import Literal
 
 import torch
 from torch import nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.utils.checkpoint import checkpoint
 
 from agentspec.trajectory import shared_prefix
@@ -146,13 +147,18 @@ def rows_logprobs(
     forward = _tree_forward if packing == "tree" else _padded_forward
     chunks = list(_chunks(rows, todo, packing, tokens_per_forward))
     recompute = packing == "tree" and len(chunks) > 1 and torch.is_grad_enabled()
-    for chunk in chunks:
+    # DDP arms its gradient reduction in forward, once per backward: the first forward is its own and is not repeated
+    # in the backward pass; the others go to the module inside.
+    replicated = isinstance(model, DistributedDataParallel)
+    inner = model.module if replicated else model
+    for number, chunk in enumerate(chunks):
         sequences = [rows[i].sequence for i in chunk]
         places = [(i, p) for i, s in enumerate(sequences) for p, m in enumerate(s.mask) if m]
-        if recompute:
-            logp, entropy = checkpoint(forward, model, sequences, places, device, use_reentrant=False)
+        arms = replicated and number == 0
+        if recompute and not arms:
+            logp, entropy = checkpoint(forward, inner, sequences, places, device, use_reentrant=False)
         else:
-            logp, entropy = forward(model, sequences, places, device)
+            logp, entropy = forward(model if arms else inner, sequences, places, device)
         index = (
             torch.tensor([chunk[r] for r, _ in places], device=device),
             torch.tensor([p - 1 for _, p in places], device=device),
@@ -160,8 +166,9 @@ def rows_logprobs(
         logps = logps.index_put(index, logp)
         entropies = entropies.index_put(index, entropy.detach())
     if not todo:
-        # Every rank takes part in the backward pass, with or without something to learn.
-        logps = logps + 0.0 * sum(p.sum() for p in model.parameters() if p.requires_grad)
+        # Every rank takes part in the forward and the backward pass, with or without something to learn: otherwise
+        # the others would wait for its gradients.
+        logps = logps + 0.0 * forward(model, [blank_row(0).sequence], [(0, 1)], device)[0].sum()
     return logps, entropies
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from accelerate.utils import gather_object
 from torch import nn
-from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
+from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, rotate_checkpoints
 from trl import GRPOTrainer
 
 from agentspec.episode import MakeEnv, Runner, make_env
@@ -26,7 +26,7 @@ from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
 from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
 from trainers.config import ScaffoldConfig
-from trainers.resume import ScaffoldState, load_state, rewind_logs, rows_of, save_state
+from trainers.resume import ScaffoldState, load_state, rewind_logs, rows_of, save_state, unmark
 from trainers.rollouts import collect, rollout_jobs
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
@@ -87,6 +87,8 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         if self.accelerator.is_main_process:
             config, spec = self.args.to_dict(), self.args.spec.to_data()
             self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
+            if not resume_from_checkpoint:
+                rewind_logs(self.run_log, 0)  # of a run that ended before its first checkpoint, say
         return super().train(resume_from_checkpoint=resume_from_checkpoint, **kwargs)
 
     @property
@@ -144,7 +146,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             policy=f"step-{self.state.global_step}",
         )
         self._sync_weights()
-        self._episodes = collect(runner, jobs, retries=self.args.retries)
+        self._episodes = collect(runner, jobs, retries=self.args.retries, rewards=self.rewards_used)
         self._log_episodes(mode)
         if mode == "train":
             self._memory = self._carried_memory()
@@ -293,12 +295,27 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
     # --- checkpoints ---------------------------------------------------------------------------------------------
 
     def _save_checkpoint(self, model: nn.Module, trial: Any) -> None:
-        super()._save_checkpoint(model, trial)
-        folder = Path(self._get_output_dir(trial=trial)) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
+        """As TRL's; the main process's state is written last, and older checkpoints go only after that."""
+        run = self._get_output_dir(trial=trial)
+        folder = Path(run) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
+        main = self.accelerator.is_main_process
+        if main:
+            unmark(folder)
+        limit, self.args.save_total_limit = self.args.save_total_limit, None
+        try:
+            super()._save_checkpoint(model, trial)
+        finally:
+            self.args.save_total_limit = limit
         unused = self._step % self._steps_per_round != 0
         buffered = rows_of(self._buffered_inputs, ROWS) if unused else ()
         state = ScaffoldState(self._step, self._round, buffered, self._memory)
-        save_state(folder, state, self.accelerator.process_index)
+        if not main:
+            save_state(folder, state, self.accelerator.process_index)
+        self.accelerator.wait_for_everyone()
+        if main:
+            save_state(folder, state)
+            best = self.state.best_model_checkpoint
+            rotate_checkpoints(run, save_total_limit=limit, best_model_checkpoint=best, use_mtime=True)
 
     def _get_train_sampler(self, dataset: Any = None) -> Any:
         self._task_sampler = super()._get_train_sampler(dataset)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,15 +28,19 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
 
     from agentspec.llm.models import resolve
 
+    if config.adapter and config.lora_r == 0:
+        raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
+    adapter = resolve_adapter(config.adapter) if config.adapter else ""
     source = resolve(config.model)
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
     tokenizer = AutoTokenizer.from_pretrained(source.path)
     model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
-    if config.adapter:
-        if config.lora_r == 0:
-            raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
+    if adapter:
         try:
-            return PeftModel.from_pretrained(model, resolve_adapter(config.adapter), is_trainable=True), tokenizer
+            policy = PeftModel.from_pretrained(model, adapter, is_trainable=True)
+            # A shipped adapter names its base by alias; what is saved must name what PEFT itself can find.
+            policy.peft_config["default"].base_model_name_or_path = str(source.path)
+            return policy, tokenizer
         except (OSError, ValueError) as error:
             raise LLMError(f"adapter {config.adapter!r} cannot be loaded: {error}") from error
     if config.lora_r == 0:
@@ -67,8 +72,18 @@ def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
 
 
 def resolve_adapter(name: str) -> str:
-    """A PEFT folder, by path or by the name of an adapter that ships with ``trainers``."""
-    from pathlib import Path
+    """A PEFT adapter: a folder, the name of one that ships with ``trainers``, or a hub id (``owner/name``).
 
-    bundled = Path(__file__).parent / "adapters" / name
-    return str(bundled) if (bundled / "adapter_config.json").is_file() else name
+    Raises:
+        LLMError: none of these.
+    """
+    shipped = Path(__file__).parent / "adapters"
+    bundled = shipped / name
+    if (bundled / "adapter_config.json").is_file():
+        return str(bundled)
+    if (Path(name) / "adapter_config.json").is_file() or (name.count("/") == 1 and not Path(name).exists()):
+        return name
+    names = sorted(p.parent.name for p in shipped.glob("*/adapter_config.json"))
+    raise LLMError(
+        f"adapter {name!r} is no folder with an adapter_config.json, and none that ships ({', '.join(names) or 'none'})"
+    )

@@ -3,6 +3,8 @@
 TRL and transformers save weights, optimiser, scheduler, their random states and the position in the data. A run inside
 a scaffold also has: the position within a generation round, rows that were generated and not yet used, and memories
 that outlive episodes. They are saved beside the rest as JSON (rows are token lists: nothing is pickled).
+
+The main process's state is the last file of a checkpoint: a folder without it was cut short and is not resumed from.
 """
 
 from __future__ import annotations
@@ -14,11 +16,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
+
 from agentspec.state import write_atomic
 from trainers.batches import Row
 from trainers.sequences import TokenSequence
 
 FILE = "scaffold_state.json"
+TRAINER_STATE = "trainer_state.json"
 FORMAT = 1
 
 
@@ -49,6 +54,26 @@ def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
         "memory": None if state.memory is None else base64.b64encode(state.memory).decode(),
     }
     write_atomic(Path(folder) / _name(rank), json.dumps(data))
+
+
+def unmark(folder: str | Path) -> None:
+    """Declare a checkpoint incomplete: it is about to be written (again)."""
+    (Path(folder) / FILE).unlink(missing_ok=True)
+
+
+def last_complete_checkpoint(folder: str | Path) -> Path | None:
+    """The newest checkpoint of a run that was written to its end; ``None`` if there is none.
+
+    A run that was killed while saving leaves a folder without its last file, or (rotation cut short) without its
+    trainer state; both are passed over.
+    """
+    found = [
+        (int(number), path)
+        for path in Path(folder).glob(f"{PREFIX_CHECKPOINT_DIR}-*")
+        if (number := path.name.rpartition("-")[2]).isdigit()
+    ]
+    complete = [(n, p) for n, p in found if (p / FILE).is_file() and (p / TRAINER_STATE).is_file()]
+    return max(complete)[1] if complete else None
 
 
 def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:

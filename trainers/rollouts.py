@@ -15,6 +15,7 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.recorder import derive_seed
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
+from rewards.base import NonFiniteRewardError, RewardSet
 
 TEST_SEEDS = 20_000
 """Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
@@ -68,17 +69,31 @@ def rollout_jobs(
     return [Job(task_of(row), (first + i) % group, run_seed, memory) for i, row in enumerate(rows)]
 
 
-def collect(runner: Runner, jobs: Sequence[Job], *, retries: int = 0) -> list[Trajectory]:
+def collect(
+    runner: Runner, jobs: Sequence[Job], *, retries: int = 0, rewards: RewardSet | None = None
+) -> list[Trajectory]:
     """Run the jobs; every failure is a trajectory too.
 
     A failed job is run again up to ``retries`` times, each time with a seed of its own; what still fails stays failed.
+    With ``rewards``, an episode whose reward is not finite is a failure as well.
     """
-    episodes = runner.run(jobs)
+    episodes = [_scored(t, rewards) for t in runner.run(jobs)]
     for attempt in range(1, retries + 1):
         failed = [i for i, t in enumerate(episodes) if not t.scorable]
         if not failed:
             break
         again = [replace(jobs[i], run_seed=derive_seed(jobs[i].run_seed, "retry", attempt)) for i in failed]
         for i, trajectory in zip(failed, runner.run(again), strict=True):
-            episodes[i] = trajectory
+            episodes[i] = _scored(trajectory, rewards)
     return episodes
+
+
+def _scored(trajectory: Trajectory, rewards: RewardSet | None) -> Trajectory:
+    """The episode, failed if its reward is no number."""
+    if rewards is None:
+        return trajectory
+    try:
+        rewards.terms(trajectory)
+    except NonFiniteRewardError as error:
+        return replace(trajectory, status="failed", error=str(error))
+    return trajectory

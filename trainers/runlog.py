@@ -46,12 +46,23 @@ class RunLog:
             file.write(json.dumps(jsonable(record), sort_keys=True) + "\n")
 
     def read(self, name: str) -> list[dict[str, Any]]:
-        """All records of a JSONL file of this run (none if it does not exist)."""
+        """All whole records of a JSONL file of this run (none if it does not exist); the file stays as it is.
+
+        Raises:
+            ValueError: naming file and line of what is not JSON.
+        """
         path = self.folder / name
         if not path.is_file():
             return []
-        drop_partial_line(path)
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
+        records = []
+        for number, line in enumerate(whole.split("\n"), 1):
+            if line.strip():
+                try:
+                    records.append(json.loads(line))
+                except ValueError as error:
+                    raise ValueError(f"{path}, line {number}: not JSON ({error}); the file was damaged") from error
+        return records
 
     def rewind(self, name: str, key: str, last: int) -> None:
         """Drop records whose ``key`` exceeds ``last``: a resumed run writes them again."""

@@ -84,7 +84,8 @@ def weigh(
             continue
         for sequence in build_sequences(trajectory, config.train_filter):
             rows.append(Row(sequence, _per_token(sequence, advantages[first + i]), i))
-    return Weighed(rows, _metrics(everyone, returns, silent, rows, len(episodes)))
+    metrics = _metrics(everyone, returns, silent, rows, len(episodes)) | _truncated(episodes, config)
+    return Weighed(rows, metrics)
 
 
 def _credit(trajectory: Trajectory, config: ScaffoldConfig, rewards: RewardSet) -> EpisodeCredit:
@@ -139,6 +140,14 @@ def _metrics(
         "rollouts/trained_tokens": float(sum(trained)),
         "rollouts/multi_row_episodes": sum(_counts(rows)[e] > 1 for e in _counts(rows)) / max(1, episodes),
     }
+
+
+def _truncated(episodes: Sequence[Trajectory], config: ScaffoldConfig) -> dict[str, float]:
+    """Per kind of trained call: the share of completions that hit their length limit (a summary cut off, say)."""
+    cut: dict[str, list[bool]] = {}
+    for call in (c for t in episodes for c in t.calls if config.train_filter.matches(c.tag.path)):
+        cut.setdefault(call.tag.path, []).extend(c.finish_reason == "length" for c in call.completions)
+    return {f"calls/{path}/truncated": sum(flags) / len(flags) for path, flags in cut.items() if flags}
 
 
 def _counts(rows: Sequence[Row]) -> dict[int, int]:

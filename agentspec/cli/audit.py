@@ -1,0 +1,42 @@
+"""``agentspec audit``: a training run's updates, checked against its episodes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from typing import Any
+
+
+def add_parser(commands: Any) -> None:
+    """Arguments of ``agentspec audit``."""
+    parser = commands.add_parser(
+        "audit",
+        help="verify every update of a training run",
+        description=(
+            "Rebuild the rows of every update from the logged episodes and check tokens, masks, advantages and "
+            "denominators; prints a receipt per update. Exit code 1 if anything does not agree."
+        ),
+    )
+    parser.add_argument("run", metavar="RUN", help="folder of the run (its output_dir)")
+    parser.add_argument("--step", type=int, metavar="N", help="only the update of this optimiser step (default: all)")
+    parser.add_argument("--json", action="store_true", help="print the receipts as JSON, one line each")
+    parser.set_defaults(command=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the receipts; exit code 1 on a violation."""
+    from trainers.audit import audit
+
+    updates = violations = 0
+    for receipt in audit(arguments.run, arguments.step):
+        updates += 1
+        violations += len(receipt.violations)
+        if arguments.json:
+            print(json.dumps(asdict(receipt), sort_keys=True))
+        else:
+            print("\n".join(receipt.lines()))
+    if not arguments.json:
+        verdict = "no violation" if not violations else f"{violations} violation{'s' * (violations > 1)}"
+        print(f"{updates} update{'s' * (updates != 1)} audited: {verdict}")
+    return 1 if violations else 0

@@ -1,0 +1,203 @@
+"""Invariant 5: two processes take the same step as one process on the same global batch.
+
+``accelerate launch`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny
+model on the same global batch of eight rollouts; the weights after two steps must agree.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("trl")
+
+import torch
+from datasets import Dataset
+from peft import LoraConfig, get_peft_model
+from safetensors.torch import load_file, save_file
+from transformers import TrainerCallback
+
+from agentspec.episode import Job
+from agentspec.trajectory import Trajectory
+from agentspec.types import Task
+from tests.tiny import tiny_model, tiny_tokenizer
+from tests.toy_env import TOY
+from tests.trainers.builders import call, episode
+from trainers import grpo as grpo_module
+from trainers.audit import audit
+from trainers.config import ScaffoldConfig
+from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.rollouts import collect, task_rows
+from trainers.runlog import RunLog
+
+ROOT = Path(__file__).resolve().parents[2]
+ROLLOUTS = 8
+
+# Four rollouts per process: with eight per task a group spans both processes; with four, each process has one group.
+CASES: dict[str, dict[str, Any]] = {
+    "tree": {"num_generations": 8},
+    "chunks": {"num_generations": 8, "tokens_per_forward": 30},
+    "padded": {"num_generations": 8, "packing": "padded"},
+    "per_token": {"num_generations": 8, "estimator": "reward_to_go"},
+    # The second task pays everybody alike: the process that holds its group has nothing to learn.
+    "idle": {"num_generations": 4, "max_steps": 1},
+    "failed": {"num_generations": 8},
+    "kl": {"num_generations": 8, "beta": 0.1},
+    "played": {"num_generations": 8},
+    "cut": {"num_generations": 8, "save_strategy": "steps", "save_steps": 1, "steps_per_generation": 4},
+}
+
+
+def built_episode(case: str, job: Job) -> Trajectory:
+    """1 to 3 rows and one return per (task, rollout), the same in whichever process it is played."""
+    number = 8 * job.task.seed + job.rollout
+    g = torch.Generator().manual_seed(number)
+    calls = []
+    for r in range(1 + (number * 5) % 7 % 3):
+        prompt = torch.randint(0, 250, (3 + number % 4,), generator=g).tolist()
+        answer = torch.randint(0, 250, (2 + (number + r) % 3,), generator=g).tolist()
+        calls.append(call(r, [r, *prompt], answer))
+    value = 3.0 if case == "idle" and job.task.seed % 2 else float((7 * number) % 5)
+    status = "failed" if case == "failed" and job.rollout in (1, 6) else "completed"
+    return episode(calls, [value], rollout=job.rollout, status=status)
+
+
+def make_trainer(folder: Path, case: str) -> ScaffoldGRPOTrainer:
+    processes = int(os.environ.get("WORLD_SIZE", "1"))
+    agent = {"reasoning": "direct", "memory": {"name": "summary", "every": 2, "summary_tokens": 4}}
+    settings: dict[str, Any] = {
+        "output_dir": str(folder),
+        "agent": {**agent, "sampling": {"max_tokens": 8}},
+        "train_calls": ["reasoning.*", "memory.summary"],
+        "per_device_train_batch_size": 4 // processes,
+        "gradient_accumulation_steps": 2,
+        "max_steps": 2,
+        "learning_rate": 1e-2,
+        "lr_scheduler_type": "constant",
+        "optim": "sgd",
+        "report_to": [],
+        "use_cpu": True,
+        "bf16": False,
+        "gradient_checkpointing": False,
+        "save_strategy": "no",
+        "logging_steps": 1,
+        "disable_tqdm": True,
+        **CASES[case],
+    }
+    tokenizer = tiny_tokenizer()
+    tasks = [Task(TOY, seed, {"steps": 5, "menu": True}) for seed in range(4)]
+    model = tiny_model(tokenizer)
+    if case == "kl":  # the reference is the base under the adapter
+        model = get_peft_model(model, LoraConfig(r=2, lora_alpha=4, target_modules=["q_proj", "v_proj"]))
+    return ScaffoldGRPOTrainer(
+        model,
+        ScaffoldConfig(**settings),
+        train_dataset=Dataset.from_list(task_rows(tasks)),
+        processing_class=tokenizer,
+    )
+
+
+class _Stop(TrainerCallback):
+    def on_step_end(self, args: Any, state: Any, control: Any, **_: Any) -> Any:
+        control.should_training_stop = True
+        return control
+
+
+def run_cases(out: Path) -> None:
+    """What every process does: train each case; the main process writes the weights."""
+    for case in CASES:
+        built = case != "played" and case != "cut"
+        grpo_module.collect = (  # type: ignore[assignment]
+            (lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs]) if built else collect
+        )
+        trainer = make_trainer(out / case, case)
+        if case == "cut":  # stopped in the middle of a round, then resumed by a new trainer
+            trainer.add_callback(_Stop())
+            trainer.train()
+            trainer = make_trainer(out / case, case)
+            trainer.train(resume_from_checkpoint=str(out / case / "checkpoint-1"))
+        else:
+            trainer.train()
+        if trainer.accelerator.is_main_process:
+            weights = trainer.accelerator.unwrap_model(trainer.model).state_dict()
+            kept = {n: w.clone().contiguous() for n, w in weights.items()}
+            save_file(kept, out / f"{case}.safetensors")
+        trainer.accelerator.wait_for_everyone()
+
+
+def launch(out: Path, processes: int) -> Path:
+    out.mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes", str(processes)]
+    command += ["--num_machines", "1", "--mixed_precision", "no", "--dynamo_backend", "no"]
+    command += ["--num_cpu_threads_per_process", "1", "--main_process_port", str(port)]
+    command += ["-m", "tests.trainers.test_data_parallel", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
+    """Folders of the run with one process and of the run with two."""
+    folder = tmp_path_factory.mktemp("parallel")
+    yield launch(folder / "one", 1), launch(folder / "two", 2)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_two_processes_take_the_step_of_one(runs: tuple[Path, Path], case: str) -> None:
+    one, two = (load_file(folder / f"{case}.safetensors") for folder in runs)
+    if case == "kl":
+        moved = max(w.abs().max().item() for n, w in one.items() if "lora_B" in n)  # these start at zero
+    else:
+        start = tiny_model(tiny_tokenizer()).state_dict()
+        moved = max((one[n] - start[n]).abs().max().item() for n in one)
+    assert moved > 1e-5
+    assert max((one[n] - two[n]).abs().max().item() for n in one) < 1e-6
+
+
+@pytest.mark.parametrize("case", ["tree", "failed", "played", "cut"])
+def test_the_logs_of_two_processes_are_those_of_one(runs: tuple[Path, Path], case: str) -> None:
+    one, two = (RunLog(folder / case).read("updates.jsonl") for folder in runs)
+    assert len(one) == len(two) > 0
+    for a, b in zip(one, two, strict=True):
+        assert a["episodes"] == b["episodes"] and a["returns"] == b["returns"]
+        assert [r["digest"] for r in a["rows"]] == [r["digest"] for r in b["rows"]]
+        assert a["denominator"] == b["denominator"] > 0
+    one, two = (RunLog(folder / case).read("metrics.jsonl") for folder in runs)
+    for a, b in zip(one, two, strict=True):
+        assert a.get("reward") == pytest.approx(b.get("reward"))  # none in the second half of a round
+        assert a["grad_norm"] == pytest.approx(b["grad_norm"], rel=1e-4)
+
+
+@pytest.mark.parametrize("case", ["played", "cut"])
+def test_the_audit_reads_the_episodes_of_every_process(runs: tuple[Path, Path], case: str) -> None:
+    files = {p.name for p in (runs[1] / case / "trajectories").glob("*.jsonl")}
+    assert {"000000.jsonl", "000000.rank1.jsonl"} <= files
+    receipts = list(audit(runs[1] / case))
+    assert receipts and all(r.episodes % ROLLOUTS == 0 and r.trained for r in receipts)
+    assert not [v for r in receipts for v in r.violations]
+    # Rollouts of a group that spans processes are different rollouts of one task.
+    record = RunLog(runs[1] / case).read("updates.jsonl")[0]
+    assert len(set(record["episodes"])) == len(record["episodes"])
+
+
+def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:
+    rows = [r["episode"] for r in RunLog(runs[1] / "tree").read("updates.jsonl")[0]["rows"]]
+    first = sum(e < ROLLOUTS // 2 for e in rows)
+    assert first != len(rows) - first
+    assert json.loads((runs[1] / "tree" / "manifest.json").read_text())["config"]["num_generations"] == 8
+
+
+if __name__ == "__main__":
+    run_cases(Path(sys.argv[1]))
