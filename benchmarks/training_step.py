@@ -3,10 +3,11 @@
     python -m benchmarks.training_step [--json] [--rollouts 8] [--turns 8] [--repeats 3]
 
 Rows have the shape of real episodes in three layouts (token counts of the quick-start: a static prompt, then an
-observation and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one per summary
-segment. Both sides see the same tokens, masks and advantages and the same LoRA policy; they run in turn, A B A B, in one
-process, and the median is reported. Stock TRL gets its own batches: prompts padded left, completions padded right, the
-rows of a micro-batch as they come. ``max_rel_grad_diff`` is the largest relative difference of a parameter's gradient.
+observation and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one
+per summary segment. Both sides see the same tokens, masks and advantages and the same LoRA policy; they run in turn,
+A B A B, in one process, and the median is reported. Stock TRL gets its own batches: prompts padded left, completions
+padded right, the rows of a micro-batch as they come. ``max_rel_grad_diff`` is the largest relative difference of a
+parameter's gradient.
 """
 
 from __future__ import annotations
