@@ -98,12 +98,23 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
         primary = primary_metric(list(members))
         heading, digits = BY_NAME[primary].heading, BY_NAME[primary].digits
         parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} bootstrap interval.", ""]
+        parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
         for by in ("policy", "scaffold"):
             compared = differences(members, primary, by=by, level=level)
             if compared:
                 parts += [f"Paired differences in {heading}, by {by}:", "", *_differences(compared, by, digits), ""]
     return "\n".join(parts)
+
+
+def _world(rows: Sequence[Row]) -> list[str]:
+    """What was played: environment, options and, where the environment has them, the rule set."""
+    lines = []
+    for row in rows:
+        options = ", ".join(f"{k} {v}" for k, v in sorted((row.get("options") or {}).items()))
+        rules = (row.get("env_metrics") or {}).get("rules")
+        lines.append(f"World: {row.get('env', '')} ({options or 'defaults'})" + (f"; rules: {rules}." if rules else "."))
+    return list(dict.fromkeys(lines))[:4]
 
 
 def write_report(rows: Sequence[Row], folder: str | Path, *, level: float = 0.95) -> None:

@@ -115,3 +115,19 @@ def test_plots_are_pictures(tmp_path: Path) -> None:
     assert not matrix_heatmap([], tmp_path / "none.png") and not (tmp_path / "none.png").exists()
     with pytest.raises(ValueError, match="unknown metric"):
         matrix_heatmap(summarise(ROWS), tmp_path / "none.png", metric="profit")
+
+
+def test_the_report_names_the_world_and_its_rules() -> None:
+    row = {
+        "tasks": "t",
+        "policy": "p",
+        "scaffold": "s",
+        "task": "a",
+        "status": "completed",
+        "env": "deliverybench",
+        "options": {"size": "tiny"},
+        "env_metrics": {"rules": "fair"},
+        "net_earnings": 1.0,
+        "return": 1.0,
+    }
+    assert "World: deliverybench (size tiny); rules: fair." in markdown([row])

@@ -1,7 +1,7 @@
 """Invariant 5: two processes take the same step as one process on the same global batch.
 
-``accelerate launch`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny
-model on the same global batch of eight rollouts; the weights after two steps must agree.
+``torchrun`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny model on the
+same global batch of eight rollouts; the weights after two steps must agree.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CASES: dict[str, dict[str, Any]] = {
     "padded": {"num_generations": 8, "packing": "padded"},
     "per_token": {"num_generations": 8, "estimator": "reward_to_go"},
     # The second task pays everybody alike: the process that holds its group has nothing to learn.
-    "idle": {"num_generations": 4, "max_steps": 1},
+    "idle": {"num_generations": 4, "max_steps": 1, "shuffle_dataset": False},
     "failed": {"num_generations": 8},
     "kl": {"num_generations": 8, "beta": 0.1},
     "played": {"num_generations": 8},
@@ -119,6 +119,7 @@ def run_cases(out: Path) -> None:
             (lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs]) if built else collect
         )
         trainer = make_trainer(out / case, case)
+        assert trainer.accelerator.num_processes == int(os.environ["WORLD_SIZE"])
         if case == "cut":  # stopped in the middle of a round, then resumed by a new trainer
             trainer.add_callback(_Stop())
             trainer.train()
@@ -138,11 +139,13 @@ def launch(out: Path, processes: int) -> Path:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes", str(processes)]
-    command += ["--num_machines", "1", "--mixed_precision", "no", "--dynamo_backend", "no"]
-    command += ["--num_cpu_threads_per_process", "1", "--main_process_port", str(port)]
+    # `accelerate launch --cpu` starts a single process whatever it is asked for (unless there is MPI); torchrun is what
+    # it uses for several.
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node", str(processes)]
+    command += ["--master_addr", "127.0.0.1", "--master_port", str(port)]
     command += ["-m", "tests.trainers.test_data_parallel", str(out)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr[-4000:]
     return out
 

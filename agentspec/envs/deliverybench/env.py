@@ -279,6 +279,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "deliveries": len(world.state.settlements),
             "clock_s": view["clock_s"],
             "hourly_profit": earned / self.shift_hours,
+            "rules": self.rules.name,
         }
         info: dict[str, Any] = {
             "instruction": self.instruction,
