@@ -146,7 +146,7 @@ def start(config: Path, log: Path) -> subprocess.Popen[bytes]:
 
 
 def finish(config: Path, run: Path) -> float:
-    """Run to the end; seconds from the manifest (training begins) to the end.
+    """Run to the end; seconds from the manifest (training begins) to the final weights.
 
     Raises:
         RuntimeError: the run failed.
@@ -155,9 +155,10 @@ def finish(config: Path, run: Path) -> float:
     (run / "manifest.json").unlink(missing_ok=True)
     process = start(config, log)
     began = wait_for(run / "manifest.json", process)
+    ended = wait_for(run / "adapter_model.safetensors", process)
     if process.wait() != 0:
         raise RuntimeError(f"the run in {run} failed:\n{log.read_text(encoding='utf-8', errors='replace')[-3000:]}")
-    return time.perf_counter() - began
+    return ended - began
 
 
 def kill_after(config: Path, run: Path, delay: float) -> bool:

@@ -8,7 +8,6 @@ in their place: advantages per episode, a fixed number of micro-batches, the den
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,18 @@ from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
 from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
 from trainers.config import ScaffoldConfig
-from trainers.resume import ScaffoldState, load_state, rewind_logs, rows_of, save_state, unmark
+from trainers.resume import (
+    ScaffoldState,
+    last_complete_checkpoint,
+    load_state,
+    restore_finished,
+    rewind_logs,
+    rows_of,
+    save_state,
+    unmark,
+)
 from trainers.rollouts import collect, rollout_jobs
-from trainers.runlog import RunLog
+from trainers.runlog import RunLog, paths_called, transcript
 from trainers.sequences import build_sequences
 from trainers.tree import enable_tree
 from trainers.weighing import weigh
@@ -83,13 +91,19 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         self._memory: bytes | None = None
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
-        """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command)."""
+        """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command).
+
+        ``resume_from_checkpoint=True`` means the last complete checkpoint in ``output_dir``, if there is one.
+        """
+        if resume_from_checkpoint is True:
+            resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
         if self.accelerator.is_main_process:
             config, spec = self.args.to_dict(), self.args.spec.to_data()
             self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
             if not resume_from_checkpoint:
                 rewind_logs(self.run_log, 0)  # of a run that ended before its first checkpoint, say
-        return super().train(resume_from_checkpoint=resume_from_checkpoint, **kwargs)
+        finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
+        return finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
 
     @property
     def last_episodes(self) -> list[Trajectory]:
@@ -151,7 +165,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         if mode == "train":
             self._memory = self._carried_memory()
         stand_in = [self._tokenizer.pad_token_id]
-        completions = [[{"role": "assistant", "content": _transcript(t)}] for t in self._episodes]
+        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self._episodes]
         n = len(self._episodes)
         return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
 
@@ -189,7 +203,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         if mode == "train" and scored and not any(build_sequences(t, self.args.train_filter) for t in scored):
             raise SpecError(
                 f"no call of this generation batch matched train_calls {self.args.train_calls} with credits "
-                f"{self.args.train_credits}; the scaffold called {sorted(_paths(self._episodes))}"
+                f"{self.args.train_credits}; the scaffold called {sorted(paths_called(self._episodes))}"
             )
         return weighed.rows
 
@@ -384,14 +398,3 @@ def local_llm(model: nn.Module, tokenizer: Any) -> LLM:
     from agentspec.llm.local import LocalLLM
 
     return LocalLLM(model, tokenizer, name="policy")
-
-
-def _paths(trajectories: Sequence[Trajectory]) -> Counter[str]:
-    return Counter(f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions)
-
-
-def _transcript(trajectory: Trajectory) -> str:
-    """What the agent did, for TRL's completion logs."""
-    if not trajectory.scorable:
-        return f"[failed] {trajectory.error}"
-    return "\n".join(t.action_text for t in trajectory.transitions)

@@ -16,8 +16,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
+from transformers import TrainerState
+from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput
 
+from agentspec.registry import SpecError
 from agentspec.state import write_atomic
 from trainers.batches import Row
 from trainers.sequences import TokenSequence
@@ -74,6 +76,28 @@ def last_complete_checkpoint(folder: str | Path) -> Path | None:
     ]
     complete = [(n, p) for n, p in found if (p / FILE).is_file() and (p / TRAINER_STATE).is_file()]
     return max(complete)[1] if complete else None
+
+
+def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None:
+    """The result of a run whose checkpoint is its last one, with the weights loaded; ``None`` if steps are left.
+
+    The training loop would take one step too many: it looks at the step count only after a step.
+
+    Raises:
+        SpecError: the run is over, and its weights are sharded over processes.
+    """
+    path = Path(checkpoint) / TRAINER_STATE
+    if not path.is_file():
+        return None
+    state = TrainerState.load_from_json(str(path))
+    wanted = trainer.args.max_steps if trainer.args.max_steps > 0 else state.max_steps
+    if state.global_step < wanted:
+        return None
+    if trainer.is_deepspeed_enabled or trainer.is_fsdp_enabled:
+        raise SpecError(f"{checkpoint} is the last of {wanted} steps; export it, or raise max_steps to train on")
+    trainer._load_from_checkpoint(str(checkpoint))
+    trainer.state = state
+    return TrainOutput(state.global_step, 0.0, {})
 
 
 def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:

@@ -107,3 +107,45 @@ def test_state_round_trip(tmp_path: Path) -> None:
     (tmp_path / "scaffold_state.json").write_text('{"format": 99}')
     with pytest.raises(ValueError, match="format 99, expected 1"):
         load_state(tmp_path)
+
+
+def test_a_finished_run_takes_no_step_more(tmp_path: Path) -> None:
+    """Killed after its last checkpoint, before the final weights were written: resuming gives exactly these."""
+    whole = trainer(tmp_path, max_steps=2)
+    whole.train()
+    again = trainer(tmp_path, max_steps=2)
+    again.train(resume_from_checkpoint=True)  # the last complete checkpoint
+    assert again.state.global_step == 2
+    expected, got = weights(whole), weights(again)
+    assert all(torch.equal(expected[n], got[n]) for n in expected)
+    assert [r["round"] for r in RunLog(tmp_path).read("updates.jsonl")] == [0, 1]
+    longer = trainer(tmp_path, max_steps=3)
+    longer.train(resume_from_checkpoint=True)
+    assert [r["round"] for r in RunLog(tmp_path).read("updates.jsonl")] == [0, 1, 2]
+
+
+def test_a_new_run_in_the_folder_of_an_old_one_starts_new_logs(tmp_path: Path) -> None:
+    trainer(tmp_path, max_steps=2).train()
+    trainer(tmp_path, max_steps=1).train(resume_from_checkpoint=None)
+    assert [r["round"] for r in RunLog(tmp_path).read("updates.jsonl")] == [0]
+    assert [r["step"] for r in RunLog(tmp_path).read("metrics.jsonl")] == [1]
+
+
+def test_a_checkpoint_is_complete_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever interrupts a save, the checkpoint before is still there and is the one to resume from."""
+    from trainers import grpo as module
+    from trainers.resume import last_complete_checkpoint
+
+    run = trainer(tmp_path, save_total_limit=1)
+    saved = module.save_state
+
+    def interrupted(folder: Path, *args: Any) -> None:
+        if folder.name == "checkpoint-3":
+            raise KeyboardInterrupt
+        saved(folder, *args)
+
+    monkeypatch.setattr(module, "save_state", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.train()
+    assert sorted(p.name for p in tmp_path.glob("checkpoint-*")) == ["checkpoint-2", "checkpoint-3"]
+    assert last_complete_checkpoint(tmp_path) == tmp_path / "checkpoint-2"
