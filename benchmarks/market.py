@@ -1,7 +1,7 @@
 """A small text world for benchmarks: sell at the price shown, or wait.
 
-Every observation has the same number of words, an episode lasts exactly ``steps`` actions whatever the agent writes, and
-a call can be made to take ``delay_s`` seconds or to fail: what a benchmark varies, and nothing else.
+Every observation has the same number of words, an episode lasts exactly ``steps`` actions whatever the agent writes,
+and a call can be made to take ``delay_s`` seconds or to fail: what a benchmark varies, and nothing else.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     python -m benchmarks.resilience [--json] [--kills 20] [--episodes 200]
 
-*Kills.* A run of six updates of a tiny random model (LoRA, the real recipe, a process of its own) is killed with SIGKILL
-at a random point after its start, and started again with ``resume: true`` until it ends. It counts as equal if the
-final adapter is bitwise that of the uninterrupted run and so are the receipts of all updates, and the logged metrics up
-to times.
+*Kills.* A run of six updates of a tiny random model (LoRA, the real recipe, a process of its own) is killed with
+SIGKILL at a random point after its start, and started again with ``resume: true``. It counts as equal if the final
+adapter is bitwise that of the uninterrupted run, and so are the receipts of all updates and, but for times, the logged
+metrics.
 
 *Faults.* One update from 200 episodes, 50 groups of four, is made twice: with healthy environments, and with 10 % that
 crash, 5 % that hang and 5 % that pay NaN. A group without a failure must contribute exactly the same rows.
@@ -14,6 +14,7 @@ crash, 5 % that hang and 5 % that pay NaN. A group without a failure must contri
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -224,8 +225,8 @@ def one_update(folder: Path, episodes: int, faults: dict[tuple[int, int], str]) 
     config = ScaffoldConfig(
         output_dir=str(folder),
         agent={"reasoning": "direct", "sampling": {"max_tokens": 8}},
-        per_device_train_batch_size=episodes // 4,
-        gradient_accumulation_steps=4,
+        per_device_train_batch_size=episodes // 2,
+        gradient_accumulation_steps=2,
         num_generations=GROUP,
         max_steps=1,
         env_timeout_s=2.0,
@@ -246,7 +247,8 @@ def one_update(folder: Path, episodes: int, faults: dict[tuple[int, int], str]) 
         processing_class=tokenizer,
         make_env=Worlds(faults),
     )
-    trainer.train()
+    with contextlib.redirect_stdout(sys.stderr):  # the trainer prints its metrics; stdout is for the result
+        trainer.train()
     (record,) = trainer.run_log.read("updates.jsonl")
     failed = [i for i, value in enumerate(record["returns"]) if value is None]
     rows: dict[int, Any] = {}
@@ -257,7 +259,7 @@ def one_update(folder: Path, episodes: int, faults: dict[tuple[int, int], str]) 
 
 def fault_run(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     """The update with and without faults, compared group by group."""
-    episodes = options.episodes - options.episodes % (4 * GROUP)
+    episodes = options.episodes - options.episodes % GROUP
     places = [(task, number) for task in range(episodes // GROUP) for number in range(GROUP)]
     random.Random(options.seed).shuffle(places)
     faults: dict[tuple[int, int], str] = {}

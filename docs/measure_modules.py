@@ -66,27 +66,33 @@ def measure(method: str, llm: LocalLLM, steps: int) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+HEAD = [
+    "| method | steps | calls per step | tokens in | of them cached | tokens out | seconds per step | fallbacks |",
+    "|---|---|---|---|---|---|---|---|",
+]
+
+
+def with_rows(page: str, rows: dict[str, str]) -> str:
+    """The page with ``rows`` (by method) in its table, in the order of :func:`methods`; other rows stay."""
+    before, _, rest = page.partition(BEGIN)
+    table, _, after = rest.partition(END)
+    known = {line.split("`")[1]: line for line in table.splitlines() if line.startswith("| `")} | rows
+    lines = [*HEAD, *(known[method] for method in methods() if method in known)]
+    return f"{before}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{after}"
+
+
 def main() -> None:
-    """Measure and write the table; without all methods named, only print it."""
+    """Measure the methods named (all by default); each row is written as soon as it is known."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("method", nargs="*")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--model", default="smollm2-135m")
     arguments = parser.parse_args()
     llm = LocalLLM.load(arguments.model, dtype="float32", device="cpu")
-    lines = [
-        "| method | steps | calls per step | tokens in | of them cached | tokens out | seconds per step | fallbacks |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
     for method in arguments.method or methods():
-        lines.append(measure(method, llm, arguments.steps))
-        print(lines[-1], flush=True)
-    if not arguments.method:
-        page = PAGE.read_text(encoding="utf-8")
-        before, _, rest = page.partition(BEGIN)
-        after = rest.partition(END)[2]
-        table = "\n".join(lines)
-        write_atomic(PAGE, f"{before}{BEGIN}\n{table}\n{END}{after}")
+        row = measure(method, llm, arguments.steps)
+        print(row, flush=True)
+        write_atomic(PAGE, with_rows(PAGE.read_text(encoding="utf-8"), {method: row}))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -150,7 +150,7 @@ def rows_logprobs(
     # DDP arms its gradient reduction in forward, once per backward: the first forward is its own and is not repeated
     # in the backward pass; the others go to the module inside.
     replicated = isinstance(model, DistributedDataParallel)
-    inner = model.module if replicated else model
+    inner: Any = model.module if replicated else model
     for number, chunk in enumerate(chunks):
         sequences = [rows[i].sequence for i in chunk]
         places = [(i, p) for i, s in enumerate(sequences) for p, m in enumerate(s.mask) if m]

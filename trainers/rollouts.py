@@ -7,6 +7,7 @@ The trainer hands over its generation batch (task rows, each repeated G times by
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -15,7 +16,7 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.recorder import derive_seed
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from rewards.base import NonFiniteRewardError, RewardSet
+from rewards import RewardSet
 
 TEST_SEEDS = 20_000
 """Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
@@ -75,7 +76,7 @@ def collect(
     """Run the jobs; every failure is a trajectory too.
 
     A failed job is run again up to ``retries`` times, each time with a seed of its own; what still fails stays failed.
-    With ``rewards``, an episode whose reward is not finite is a failure as well.
+    With ``rewards``, an episode is a failure too if its environment reported NaN or infinity and cannot be scored.
     """
     episodes = [_scored(t, rewards) for t in runner.run(jobs)]
     for attempt in range(1, retries + 1):
@@ -89,11 +90,18 @@ def collect(
 
 
 def _scored(trajectory: Trajectory, rewards: RewardSet | None) -> Trajectory:
-    """The episode, failed if its reward is no number."""
+    """The episode, failed if what its environment reported makes its reward no number.
+
+    Raises:
+        ValueError: a reward that this environment cannot be scored with: every episode would fail.
+    """
     if rewards is None:
         return trajectory
     try:
         rewards.terms(trajectory)
-    except NonFiniteRewardError as error:
-        return replace(trajectory, status="failed", error=str(error))
+    except ValueError as error:
+        reported = (value for t in trajectory.transitions for value in t.info.values())
+        if all(math.isfinite(v) for v in reported if isinstance(v, float)):
+            raise
+        return replace(trajectory, status="failed", error=f"not finite: {error}")
     return trajectory

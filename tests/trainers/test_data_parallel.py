@@ -1,7 +1,7 @@
 """Invariant 5: two processes take the same step as one process on the same global batch.
 
-``torchrun`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny model on the
-same global batch of eight rollouts; the weights after two steps must agree.
+``torchrun`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny model on
+the same global batch of eight rollouts; the weights after two steps must agree.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from trainers import grpo as grpo_module
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.resume import load_state
 from trainers.rollouts import collect, task_rows
 from trainers.runlog import RunLog
 
@@ -52,6 +53,8 @@ CASES: dict[str, dict[str, Any]] = {
     "failed": {"num_generations": 8},
     "kl": {"num_generations": 8, "beta": 0.1},
     "played": {"num_generations": 8},
+    # The second round starts from lessons that the best rollout of the first wrote, on whichever process it was.
+    "carried": {"num_generations": 8, "memory_carry": "best", "save_strategy": "steps", "save_steps": 1},
     "cut": {"num_generations": 8, "save_strategy": "steps", "save_steps": 1, "steps_per_generation": 4},
 }
 
@@ -92,6 +95,10 @@ def make_trainer(folder: Path, case: str) -> ScaffoldGRPOTrainer:
         "disable_tqdm": True,
         **CASES[case],
     }
+    if case == "carried":
+        sampling = {"max_tokens": 8}
+        settings["agent"] = {"reasoning": "direct", "reflection": "reflexion", "scope": "run", "sampling": sampling}
+        settings["train_calls"] = ["reasoning.*"]
     tokenizer = tiny_tokenizer()
     tasks = [Task(TOY, seed, {"steps": 5, "menu": True}) for seed in range(4)]
     model = tiny_model(tokenizer)
@@ -114,7 +121,7 @@ class _Stop(TrainerCallback):
 def run_cases(out: Path) -> None:
     """What every process does: train each case; the main process writes the weights."""
     for case in CASES:
-        built = case != "played" and case != "cut"
+        built = case not in ("played", "carried", "cut")
         grpo_module.collect = (  # type: ignore[assignment]
             (lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs]) if built else collect
         )
@@ -169,7 +176,7 @@ def test_two_processes_take_the_step_of_one(runs: tuple[Path, Path], case: str) 
     assert max((one[n] - two[n]).abs().max().item() for n in one) < 1e-6
 
 
-@pytest.mark.parametrize("case", ["tree", "failed", "played", "cut"])
+@pytest.mark.parametrize("case", ["tree", "failed", "played", "carried", "cut"])
 def test_the_logs_of_two_processes_are_those_of_one(runs: tuple[Path, Path], case: str) -> None:
     one, two = (RunLog(folder / case).read("updates.jsonl") for folder in runs)
     assert len(one) == len(two) > 0
@@ -193,6 +200,14 @@ def test_the_audit_reads_the_episodes_of_every_process(runs: tuple[Path, Path], 
     # Rollouts of a group that spans processes are different rollouts of one task.
     record = RunLog(runs[1] / case).read("updates.jsonl")[0]
     assert len(set(record["episodes"])) == len(record["episodes"])
+
+
+def test_every_process_carries_the_same_memory(runs: tuple[Path, Path]) -> None:
+    checkpoint = runs[1] / "carried" / "checkpoint-1"
+    first, second = load_state(checkpoint), load_state(checkpoint, 1)
+    alone = load_state(runs[0] / "carried" / "checkpoint-1")
+    assert first is not None and second is not None and alone is not None
+    assert first.memory is not None and first.memory == second.memory == alone.memory
 
 
 def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:

@@ -151,7 +151,7 @@ def test_the_denominator_counts_what_is_trained(tmp_path: Path) -> None:
 
 def test_the_logged_denominator_is_that_of_the_loss(tmp_path: Path) -> None:
     agent = {"reasoning": "direct", "memory": {"name": "summary", "every": 2, "summary_tokens": 4}}
-    # Three rows... two segments of four episodes in two micro-batches: no blank; five micro-batches: two.
+    # Three actions, a summary (not trained here) after the second: two rows per episode.
     toy_trainer(tmp_path, agent=agent | {"sampling": {"max_tokens": 8}}, max_steps=1).train()
     (record,) = RunLog(tmp_path).read("updates.jsonl")
     assert record["denominator"] == sum(r["trained"] for r in record["rows"])

@@ -1,0 +1,180 @@
+"""Long horizons: the context of GRPO (full history) and of SUPO (summaries) as episodes get longer.
+
+    python -m benchmarks.horizon [--json] [--turns 8 16 32 64 128] [--model smollm2-135m] [--rollouts 4]
+
+The same scripted market for both: ``grpo`` keeps the whole conversation, ``supo`` replaces it by a summary every eight
+actions. Answers come from a script, so that both agents act alike and episodes last exactly as long as they should;
+with ``--model`` they come from a model, and time and memory are those of real sampling. ``peak_context`` is the longest
+prompt plus answer of an episode in tokens (bytes for the script), ``seconds`` the wall-clock time of one episode,
+``rss_mb`` by how much the process grew, at most, beyond its size before the episode. The curves go to
+``docs/images/horizon.png``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "horizon.png"
+EVERY = 8
+SUMMARY = "Sold whenever the price was high, waited otherwise. Prices change at every step; go on like this."
+
+AGENTS: dict[str, dict[str, Any]] = {
+    "grpo": {"reasoning": "direct", "memory": "none", "sampling": {"max_tokens": 16}},
+    "supo": {
+        "reasoning": "direct",
+        "memory": {"name": "summary", "every": EVERY, "summary_tokens": 128},
+        "sampling": {"max_tokens": 16},
+    },
+}
+
+
+class Growth:
+    """Largest growth of the process's resident memory inside a ``with`` block, in MiB."""
+
+    def __enter__(self) -> Growth:
+        self._start, self._stop = rss_mb(), threading.Event()
+        self.peak_mb = 0.0
+        self._thread = threading.Thread(target=self._poll, daemon=True)
+        self._thread.start()
+        return self
+
+    def _poll(self) -> None:
+        while not self._stop.wait(0.005):
+            self.peak_mb = max(self.peak_mb, rss_mb() - self._start)
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.peak_mb = max(self.peak_mb, rss_mb() - self._start)
+
+
+def rss_mb() -> float:
+    """Resident memory of this process in MiB."""
+    if sys.platform != "linux":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+
+
+def release() -> None:
+    """Give freed memory back to the system, so that the next growth is its own."""
+    import ctypes
+    import gc
+
+    gc.collect()
+    if sys.platform == "linux":
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def script(request: Any) -> str:
+    """Sell at five and more, else wait; the same summary every time."""
+    if request.tag.purpose == "summary":
+        return SUMMARY
+    price = int(request.messages[-1].text.rpartition("The price is ")[2].partition(".")[0])
+    return "SELL()" if price >= 5 else "WAIT()"
+
+
+def make_llm(model: str) -> Any:
+    """The script, or a model in float32 on the CPU (an accelerator if there is one)."""
+    if not model:
+        from agentspec.llm.scripted import ScriptedLLM
+
+        return ScriptedLLM(script)
+    from agentspec.llm.local import LocalLLM
+
+    return LocalLLM.load(model, dtype="float32")
+
+
+def measure(llm: Any, agent: str, turns: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Episodes of ``turns`` actions, one after the other: medians over them."""
+    from agentspec.episode import Job, Runner
+    from agentspec.spec import AgentSpec
+    from agentspec.types import Task
+    from benchmarks.market import MARKET
+
+    world = {"steps": turns, "words": options.words, "menu": bool(options.model)}
+    runner = Runner(AgentSpec.from_data(AGENTS[agent]), llm)
+    peaks, seconds, grown, ends = [], [], [], set()
+    for seed in range(options.rollouts):
+        if options.model:
+            llm.invalidate()
+        release()
+        with Growth() as growth:
+            start = time.perf_counter()
+            (episode,) = runner.run([Job(Task(MARKET, seed, world))])
+            seconds.append(time.perf_counter() - start)
+        peaks.append(max(len(c.prompt_ids) + len(c.completions[0].token_ids) for c in episode.calls))
+        grown.append(growth.peak_mb)
+        ends.add(str(episode.metrics["ended"]))
+    return {
+        "turns": turns,
+        "peak_context": max(peaks),
+        "seconds": statistics.median(seconds),
+        "rss_mb": statistics.median(grown),
+        "ended": sorted(ends),
+    }
+
+
+def draw(results: dict[str, list[dict[str, Any]]], unit: str, path: Path) -> None:
+    """Peak context, time and memory over the number of turns."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    panels = (
+        ("peak_context", f"peak context ({unit})"),
+        ("seconds", "seconds per episode"),
+        ("rss_mb", "memory (MiB)"),
+    )
+    figure, axes = pyplot.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+    for axis, (key, label) in zip(axes, panels, strict=True):
+        for name, title in (("grpo", "GRPO, full history"), ("supo", f"SUPO, summary every {EVERY}")):
+            points = results[name]
+            axis.plot([p["turns"] for p in points], [p[key] for p in points], marker="o", label=title)
+        axis.set_xlabel("turns")
+        axis.set_title(label, fontsize=10)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axes[0].legend(frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    """All lengths for both agents; a table or JSON, and the plot."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--turns", type=int, nargs="+", default=[8, 16, 32, 64, 128])
+    parser.add_argument("--model", default="", help="a model to sample from (default: a script)")
+    parser.add_argument("--words", type=int, default=40, help="words of news in an observation")
+    parser.add_argument("--rollouts", type=int, default=4, help="episodes per length, one at a time")
+    parser.add_argument("--plot", type=Path, default=IMAGE, metavar="FILE")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    llm = make_llm(options.model)
+    for agent in AGENTS:  # imports, caches
+        measure(llm, agent, 2, options)
+    results = {agent: [measure(llm, agent, turns, options) for turns in options.turns] for agent in AGENTS}
+    draw(results, "tokens" if options.model else "bytes", options.plot)
+    if options.json:
+        print(json.dumps(results))
+        return
+    for agent, points in results.items():
+        for p in points:
+            print(
+                f"{agent}  {p['turns']:>4} turns  peak context {p['peak_context']:>7}  {p['seconds']:8.3f} s  "
+                f"{p['rss_mb']:7.1f} MiB  ended: {', '.join(p['ended'])}"
+            )
+
+
+if __name__ == "__main__":
+    main()
