@@ -113,7 +113,8 @@ def _world(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         options = ", ".join(f"{k} {v}" for k, v in sorted((row.get("options") or {}).items()))
         rules = (row.get("env_metrics") or {}).get("rules")
-        lines.append(f"World: {row.get('env', '')} ({options or 'defaults'})" + (f"; rules: {rules}." if rules else "."))
+        stated = f"; rules: {rules}." if rules else "."
+        lines.append(f"World: {row.get('env', '')} ({options or 'defaults'}){stated}")
     return list(dict.fromkeys(lines))[:4]
 
 
