@@ -1,7 +1,7 @@
 """Invariant 5: two processes take the same step as one process on the same global batch.
 
-``torchrun`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny model on
-the same global batch of eight rollouts; the weights after two steps must agree.
+``accelerate launch`` starts this file twice, with one and with two processes (gloo, CPU). Every case trains the tiny
+model on the same global batch of eight rollouts; the weights after two steps must agree.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class _Stop(TrainerCallback):
         return control
 
 
-def run_cases(out: Path) -> None:
+def run_cases(out: Path, processes: int) -> None:
     """What every process does: train each case; the main process writes the weights."""
     for case in CASES:
         built = case not in ("played", "carried", "cut")
@@ -126,7 +126,7 @@ def run_cases(out: Path) -> None:
             (lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs]) if built else collect
         )
         trainer = make_trainer(out / case, case)
-        assert trainer.accelerator.num_processes == int(os.environ["WORLD_SIZE"])
+        assert trainer.accelerator.num_processes == processes
         if case == "cut":  # stopped in the middle of a round, then resumed by a new trainer
             trainer.add_callback(_Stop())
             trainer.train()
@@ -146,11 +146,12 @@ def launch(out: Path, processes: int) -> Path:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # `accelerate launch --cpu` starts a single process whatever it is asked for (unless there is MPI); torchrun is what
-    # it uses for several.
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node", str(processes)]
-    command += ["--master_addr", "127.0.0.1", "--master_port", str(port)]
-    command += ["-m", "tests.trainers.test_data_parallel", str(out)]
+    # With `--cpu`, accelerate starts a single process whatever it is asked for (unless there is MPI). With
+    # `--multi_gpu` it starts as many as asked; without a GPU they are processes on the CPU that talk through gloo.
+    command = [sys.executable, "-m", "accelerate.commands.launch", *(["--multi_gpu"] if processes > 1 else ["--cpu"])]
+    command += ["--num_processes", str(processes), "--num_machines", "1", "--mixed_precision", "no"]
+    command += ["--dynamo_backend", "no", "--main_process_port", str(port)]
+    command += ["-m", "tests.trainers.test_data_parallel", str(out), str(processes)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr[-4000:]
@@ -218,4 +219,4 @@ def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:
 
 
 if __name__ == "__main__":
-    run_cases(Path(sys.argv[1]))
+    run_cases(Path(sys.argv[1]), int(sys.argv[2]))
