@@ -7,6 +7,7 @@ calls mostly extend each other, so a prompt is stored as the length of what it s
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -115,6 +116,11 @@ class Trajectory:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that decide what an episode is."""
+    return dict(_versions())
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
     found = {}
     for name in ("agentspec", "gymnasium", "numpy", "torch", "transformers"):
         try:
@@ -251,11 +257,15 @@ def _calls_to_json(calls: Sequence[LLMCall]) -> list[dict[str, Any]]:
 
 
 def shared_prefix(a: Sequence[int], b: Sequence[int]) -> int:
-    """Length of the longest common prefix of two token sequences."""
-    limit = min(len(a), len(b))
-    if a[:limit] == b[:limit]:
-        return limit
-    return next(i for i in range(limit) if a[i] != b[i])
+    """Length of the longest common prefix of two token sequences, by bisection over slices (each compared in C)."""
+    low, high = 0, min(len(a), len(b))
+    while low < high:
+        middle = (low + high + 1) // 2
+        if a[low:middle] == b[low:middle]:
+            low = middle
+        else:
+            high = middle - 1
+    return low
 
 
 def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:

@@ -128,3 +128,26 @@ def test_rollouts_of_one_task_have_their_own_seeds() -> None:
     jobs = [Job(Task(TOY, 0), rollout=i, run_seed=3) for i in range(4)]
     assert len({j.seed for j in jobs}) == 4
     assert jobs[1].seed == Job(Task(TOY, 0), rollout=1, run_seed=3).seed
+
+
+def test_thinking_can_cost_simulated_time() -> None:
+    options = {"size": "tiny", "action_mode": "menu", "observation": "compact", "max_steps": 3, "shift_hours": 0.3}
+    choose = ScriptedLLM(lambda request: request.sampling.choices[0])
+    left = []
+    for think_time in ("paused", {"call": 60.0, "token": 0.0}):
+        task = Task("deliverybench", 0, {**options, "think_time": think_time})
+        (trajectory,) = Runner(AgentSpec(), choose).run([Job(task)])
+        assert trajectory.status == "completed", trajectory.error
+        assert replay(trajectory, make_env) == []
+        left.append(trajectory.transitions[2].input.state["left_s"])
+    # Two decisions of one call each: two minutes of the shift, on top of what the actions took.
+    assert left[0] - left[1] >= 120.0
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "length"), [((), (1,), 0), ((1, 2, 3), (1, 2, 3), 3), ((1, 2, 3), (1, 2, 4, 5), 2), ((2,), (1,), 0)]
+)
+def test_shared_prefix(a: tuple[int, ...], b: tuple[int, ...], length: int) -> None:
+    from agentspec.trajectory import shared_prefix
+
+    assert shared_prefix(a, b) == length == shared_prefix(b, a)

@@ -59,6 +59,8 @@ class ScaffoldConfig(GRPOConfig):
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
         skip_zero_variance: leave groups whose returns are all equal out of the loss denominator too.
+        normalize: ``token`` weighs every trained token alike (an episode that trains more tokens counts more);
+            ``rollout`` weighs every rollout alike, so that call-heavy scaffolds do not inflate the loss.
         overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
             the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
@@ -94,6 +96,7 @@ class ScaffoldConfig(GRPOConfig):
     gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
     gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
     skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
+    normalize: str = field(default="token", metadata={"help": "token or rollout"})
     overlong: str = field(default="mask", metadata={"help": "mask, keep or drop"})
     overlong_ends: list[str] = field(default_factory=lambda: ["context"])
     mask_truncated: list[str] = field(default_factory=list)
@@ -179,6 +182,7 @@ class ScaffoldConfig(GRPOConfig):
         estimators = (*ESTIMATORS, *STEP_ESTIMATORS)
         for name, known in (
             ("estimator", estimators),
+            ("normalize", ("token", "rollout")),
             ("overlong", ("mask", "keep", "drop")),
             ("memory_carry", ("first", "best")),
             ("packing", ("tree", "padded")),
@@ -227,6 +231,11 @@ class ScaffoldConfig(GRPOConfig):
                     f"{name}={getattr(self, name)!r} speaks of rows, not of episodes, and is not offered; leave it at "
                     f"{wanted!r} (advantages are chosen by `estimator`)"
                 )
+        if self.normalize == "rollout" and self.loss_type not in EXACT_LOSSES:
+            raise SpecError(
+                f"normalize 'rollout' with loss_type {self.loss_type!r}: its denominator is not the number of trained "
+                f"tokens; use one of {', '.join(EXACT_LOSSES)}"
+            )
         if self.num_generations < 2:
             raise SpecError(f"num_generations is {self.num_generations}: a group needs at least 2 rollouts to compare")
 

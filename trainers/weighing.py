@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -84,8 +84,28 @@ def weigh(
             continue
         for sequence in build_sequences(trajectory, config.train_filter):
             rows.append(Row(sequence, _per_token(sequence, advantages[first + i]), i))
+    if config.normalize == "rollout":
+        rows = _per_rollout(rows, gather)
     metrics = _metrics(everyone, returns, silent, rows, len(episodes)) | _truncated(episodes, config)
     return Weighed(rows, metrics)
+
+
+def _per_rollout(rows: Sequence[Row], gather: Gather) -> list[Row]:
+    """Scale advantages so that every rollout weighs the same, however many tokens its scaffold trained.
+
+    The loss divides by all N trained tokens; a rollout with n of them counts n / N. With the factor N / (R n), R
+    rollouts with something to train, it counts 1 / R: the mean over rollouts of their mean over tokens.
+    """
+    counts: dict[int, int] = {}
+    for row in rows:
+        counts[row.episode] = counts.get(row.episode, 0) + row.sequence.trained
+    everywhere = [int(str(n)) for n in gather(list(counts.values()))]
+    total, rollouts = sum(everywhere), len(everywhere)
+    return [replace(row, advantage=_times(row.advantage, total / (rollouts * counts[row.episode]))) for row in rows]
+
+
+def _times(advantage: float | tuple[float, ...], factor: float) -> float | tuple[float, ...]:
+    return advantage * factor if isinstance(advantage, float) else tuple(a * factor for a in advantage)
 
 
 def _credit(trajectory: Trajectory, config: ScaffoldConfig, rewards: RewardSet) -> EpisodeCredit:
