@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.state import write_atomic
+from agentspec.tokens import shared_prefix
 from agentspec.types import (
     Action,
     ActionError,
@@ -254,18 +255,6 @@ def _calls_to_json(calls: Sequence[LLMCall]) -> list[dict[str, Any]]:
         rows.append(row)
         before = call.prompt_ids + (call.completions[0].token_ids if call.completions else ())
     return rows
-
-
-def shared_prefix(a: Sequence[int], b: Sequence[int]) -> int:
-    """Length of the longest common prefix of two token sequences, by bisection over slices (each compared in C)."""
-    low, high = 0, min(len(a), len(b))
-    while low < high:
-        middle = (low + high + 1) // 2
-        if a[low:middle] == b[low:middle]:
-            low = middle
-        else:
-            high = middle - 1
-    return low
 
 
 def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:

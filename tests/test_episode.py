@@ -148,6 +148,6 @@ def test_thinking_can_cost_simulated_time() -> None:
     ("a", "b", "length"), [((), (1,), 0), ((1, 2, 3), (1, 2, 3), 3), ((1, 2, 3), (1, 2, 4, 5), 2), ((2,), (1,), 0)]
 )
 def test_shared_prefix(a: tuple[int, ...], b: tuple[int, ...], length: int) -> None:
-    from agentspec.trajectory import shared_prefix
+    from agentspec.tokens import shared_prefix
 
     assert shared_prefix(a, b) == length == shared_prefix(b, a)

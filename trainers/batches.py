@@ -16,7 +16,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.checkpoint import checkpoint
 
-from agentspec.trajectory import shared_prefix
+from agentspec.tokens import shared_prefix
 from trainers.logprobs import sampled_logprobs
 from trainers.sequences import TokenSequence
 from trainers.tree import build_tree, packed_inputs, wanted_tokens

@@ -19,6 +19,7 @@ import torch
 from agentspec.llm.local_cache import PrefixCache
 from agentspec.llm.local_forward import PackedModel, Segment
 from agentspec.llm.local_rows import ChoiceRow, FreeRow, Job, Row, SampleRow, ScoreRow, choose, sample
+from agentspec.tokens import shared_prefix
 
 _TOKENS_PER_FORWARD = {"cpu": 512}
 _DEFAULT_TOKENS = 8192
@@ -81,7 +82,7 @@ class Engine:
             row.slot = slot
             row.computed = row.known = slot.length
         for before, row in pairwise(rows):
-            shared = min(_common(before.tokens, row.tokens), row.wanted)
+            shared = min(shared_prefix(before.tokens, row.tokens), row.wanted)
             if shared > row.known:
                 row.source, row.computed = before, shared
         for row in rows:
@@ -160,15 +161,3 @@ def _schedule(active: Sequence[Row], budget: int) -> list[tuple[Row, int]]:
             # A later row may copy from this one: the order is kept.
             break
     return step
-
-
-def _common(a: Sequence[int], b: Sequence[int]) -> int:
-    """Length of the longest common prefix."""
-    low, high = 0, min(len(a), len(b))
-    while low < high:
-        middle = (low + high + 1) // 2
-        if a[low:middle] == b[low:middle]:
-            low = middle
-        else:
-            high = middle - 1
-    return low

@@ -9,6 +9,7 @@ sample's index: what a row samples does not depend on what it is batched with.
 from __future__ import annotations
 
 import random
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -95,16 +96,16 @@ class ScoreRow(Row):
         self.done = not self._targets
 
 
-class SampleRow(Row):
+class SampleRow(Row, ABC):
     """A row that writes a completion."""
 
     def __init__(self, job: Job, index: int) -> None:
         super().__init__(job, index)
         self.logprobs: list[float] = []
 
+    @abstractmethod
     def completion(self) -> Completion:
         """What was written, when the row is done."""
-        raise NotImplementedError
 
     @property
     def written(self) -> list[int]:
