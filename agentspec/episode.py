@@ -301,6 +301,7 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "fallbacks": sum("fallback" in t.decision.trace for t in transitions),
         "exhausted_searches": sum(bool(t.decision.trace.get("exhausted")) for t in transitions),
         "llm_calls": len(recorder.calls),
+        "scorings": recorder.scorings,
         "input_tokens": usage.input_tokens,
         "output_tokens": usage.output_tokens,
         "cached_tokens": usage.cached_tokens,

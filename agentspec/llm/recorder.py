@@ -82,6 +82,8 @@ class Recorder:
         self._next_id = 0
         self._tokens = 0
         self._cost = 0.0
+        self.scorings = 0
+        self.scored = Usage()
 
     async def generate(self, module: str, purpose: str, messages: Sequence[Message], **overrides: Any) -> LLMCall:
         """Ask the model; the record is kept. ``overrides`` are fields of :class:`~agentspec.types.Sampling`.
@@ -108,6 +110,25 @@ class Recorder:
         self.calls.append(call)
         return call
 
+    async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
+        """Log-probabilities of continuations; metered as input tokens and bounded by the token and cost budgets.
+
+        A scoring samples nothing, so it is no call of its own: ``scorings`` counts them, ``scored`` their usage.
+
+        Raises:
+            BudgetExceededError: before the scoring, if the budget of tokens or dollars is used up.
+        """
+        replace(self.budget, calls=None).check(0, self._tokens, self._cost)
+        scores = await self.llm.score(messages, continuations, episode=self.episode)
+        texts = [m.text for m in messages] + list(continuations)
+        read = Usage(input_tokens=sum(map(self.llm.count_tokens, texts)))
+        cost = self.prices.cost(self.llm.name, read)
+        self.scorings += 1
+        self.scored = Usage(self.scored.input_tokens + read.input_tokens, cost=self.scored.cost + cost)
+        self._tokens += read.input_tokens
+        self._cost += cost
+        return scores
+
     def credit(self, call_id: int, completion: int, credit: Credit) -> None:
         """Say what one completion of one call was for.
 
@@ -124,12 +145,12 @@ class Recorder:
 
     @property
     def usage(self) -> Usage:
-        """Totals of the episode so far."""
+        """Totals of the episode so far, scorings included."""
         return Usage(
-            input_tokens=sum(c.usage.input_tokens for c in self.calls),
+            input_tokens=sum(c.usage.input_tokens for c in self.calls) + self.scored.input_tokens,
             output_tokens=sum(c.usage.output_tokens for c in self.calls),
             cached_tokens=sum(c.usage.cached_tokens for c in self.calls),
-            cost=sum(c.usage.cost for c in self.calls),
+            cost=sum(c.usage.cost for c in self.calls) + self.scored.cost,
         )
 
 
@@ -149,8 +170,8 @@ class ModuleLLM:
         self.recorder.credit(call.id, completion, "executed")
 
     async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
-        """Log-probabilities of ``continuations`` after the prompt (see :meth:`LLM.score`)."""
-        return await self.recorder.llm.score(messages, continuations, episode=self.recorder.episode)
+        """Log-probabilities of ``continuations`` after the prompt (see :meth:`Recorder.score`)."""
+        return await self.recorder.score(messages, continuations)
 
     def count_tokens(self, text: str) -> int:
         """Tokens of ``text`` for budgets of prompt sections."""

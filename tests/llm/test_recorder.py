@@ -107,3 +107,15 @@ def test_module_scores_and_counts():
     llm = ModuleLLM(recorder(), "m")
     assert asyncio.run(llm.score(ASK, ["ab"])) == (-2.0,)
     assert llm.count_tokens("abc") == 3
+
+
+def test_scorings_are_metered_and_bounded_by_tokens():
+    llm = ScriptedLLM(["ok"], score=lambda messages, continuation: 0.0)
+    rec = recorder(llm, prices=Prices({"scripted": Price(input=2.0)}), budget=Budget(tokens=8))
+    view = ModuleLLM(rec, "reasoning.rap")
+    assert asyncio.run(view.score([user("abc")], ["de", "f"])) == (0.0, 0.0)
+    # Read as bytes: 3 of the prompt, 2 + 1 of the continuations; nothing is sampled, so it is no call.
+    assert rec.usage == Usage(6, 0, 0, pytest.approx(12e-6)) and rec.calls == [] and rec.scorings == 1
+    asyncio.run(view.score([user("abc")], ["de"]))
+    with pytest.raises(BudgetExceededError, match="budget of 8 tokens"):
+        asyncio.run(view.score([user("abc")], ["de"]))

@@ -115,8 +115,9 @@ class Meter:
             self.tokens += sum(self._llm.count_tokens(text) for text in (*(m.text for m in messages), *continuations))
         try:
             return list(await asyncio.gather(*(self._llm.score(m, c) for m, c in asks)))
-        except ContextOverflowError as error:
-            self.exhausted, self._error = "context", error
+        except (BudgetExceededError, ContextOverflowError) as error:
+            self.exhausted = "episode" if isinstance(error, BudgetExceededError) else "context"
+            self._error = error
             raise OutOfBudgetError(str(error)) from error
 
     def _allowed(self, wanted: int) -> int:
