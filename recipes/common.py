@@ -52,10 +52,18 @@ def parse_config(argv: Sequence[str] | None = None, default: str = "quickstart_c
     return config
 
 
-def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
+def train(
+    config: Any, *, callbacks: Sequence[Any] = (), trainer_class: Any = None, load: Callable[[Any], Any] | None = None
+) -> Any:
     """Train as ``config`` says; returns the trainer. The final model lies in ``config.output_dir``.
 
     With ``config.resume`` the run continues from its last complete checkpoint.
+
+    Args:
+        config: a :class:`~trainers.config.ScaffoldConfig`.
+        callbacks: of the trainer.
+        trainer_class: default: :class:`~trainers.grpo.ScaffoldGRPOTrainer`.
+        load: config -> model and tokenizer; default: :func:`~trainers.policy.load_policy`.
     """
     from datasets import Dataset
 
@@ -68,13 +76,15 @@ def train(config: Any, *, callbacks: Sequence[Any] = ()) -> Any:
     config.check()
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None
-    model, tokenizer = load_policy(config)
+    model, tokenizer = (load or load_policy)(config)
     name, options = config.world
     tasks = make_tasks(name, options, config.train_tasks)
-    trainer = ScaffoldGRPOTrainer(
+    held_out = make_tasks(name, options, config.validation_tasks, split="validation") if config.validates else []
+    trainer = (trainer_class or ScaffoldGRPOTrainer)(
         model,
         config,
         train_dataset=Dataset.from_list(task_rows(tasks)),
+        eval_dataset=Dataset.from_list(task_rows(held_out)) if held_out else None,
         processing_class=tokenizer,
         callbacks=list(callbacks),
     )

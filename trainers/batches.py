@@ -23,6 +23,9 @@ from trainers.tree import build_tree, packed_inputs, wanted_tokens
 
 Packing = Literal["tree", "padded"]
 
+ROWS = "rows"
+"""Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
+
 
 @dataclass(frozen=True)
 class Row:

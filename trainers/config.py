@@ -47,6 +47,8 @@ class ScaffoldConfig(GRPOConfig):
     Args:
         model: what :func:`agentspec.llm.models.resolve` understands: a folder, ``smollm2-135m`` or a hub id.
         adapter: PEFT folder to start from (a warm start), or empty.
+        actor_adapter: training a reflector: PEFT folder of the frozen actor, or empty (the base model acts).
+        actor_temperature: training a reflector: sampling temperature of the actor; lessons have the agent's.
         agent: the agent spec: a mapping, or a path to a YAML file.
         environment: ``{name: ..., options: {...}}``: the world and its ``gymnasium.make`` arguments.
         train_tasks: number of distinct training tasks (seeds ``0 .. train_tasks - 1``).
@@ -79,12 +81,18 @@ class ScaffoldConfig(GRPOConfig):
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
+        validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
+            with ``eval_strategy: steps``; the best checkpoint by ``metric_for_best_model`` (default ``reward``, the
+            mean under the training scaffold) is kept, and is the result with ``load_best_model_at_end``.
+        validation_specs: further agent specs to validate under, beside the training scaffold.
         plots: write the reward curve as PNG when training ends.
         resume: continue from the last checkpoint in ``output_dir``.
     """
 
     model: str = field(default="smollm2-135m", metadata={"help": "folder, bundled name or hub id"})
     adapter: str = field(default="", metadata={"help": "PEFT folder to start from"})
+    actor_adapter: str = field(default="", metadata={"help": "PEFT folder of the frozen actor beside a reflector"})
+    actor_temperature: float = field(default=0.0, metadata={"help": "temperature of the actor beside a reflector"})
     agent: dict[str, Any] | str | None = field(default=None, metadata={"help": "agent spec: mapping or YAML path"})
     environment: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the world"})
     train_tasks: int = field(default=64, metadata={"help": "number of distinct training tasks"})
@@ -112,14 +120,19 @@ class ScaffoldConfig(GRPOConfig):
     lora_layers: int = field(default=0, metadata={"help": "top layers that carry LoRA; 0: all"})
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
+    validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})
+    validation_specs: list[Any] | str | None = field(default=None, metadata={"help": "further specs to validate under"})
     plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})
     resume: bool = field(default=False, metadata={"help": "continue from the last checkpoint in output_dir"})
 
     def __post_init__(self) -> None:
-        for name in ("agent", "environment", "rewards", "eval_specs", "eval_sampling"):
+        for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
             value = getattr(self, name)
             if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
                 setattr(self, name, _json(name, value))
+        if self.validates:
+            self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
+            self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
         super().__post_init__()
 
     @property
@@ -147,12 +160,19 @@ class ScaffoldConfig(GRPOConfig):
         return given["name"], dict(given.get("options") or {})
 
     @property
+    def validates(self) -> bool:
+        """Whether held-out tasks are played while training."""
+        return getattr(self.eval_strategy, "value", self.eval_strategy) != "no" or bool(self.eval_on_start)
+
+    @property
     def evaluation_specs(self) -> list[Any]:
-        """Agent specs to evaluate under: the training scaffold if none are named."""
-        specs = self.eval_specs
-        if specs is None:
-            return [self.spec]
-        return [specs] if isinstance(specs, str) else list(specs)
+        """Agent specs to evaluate under after training: the training scaffold if none are named."""
+        return [self.spec] if self.eval_specs is None else _listed(self.eval_specs)
+
+    @property
+    def other_specs(self) -> list[AgentSpec]:
+        """Agent specs to validate under, beside the training scaffold."""
+        return [agent_spec(s) for s in _listed(self.validation_specs or [])]
 
     @property
     def evaluation_sampling(self) -> dict[str, Any]:
@@ -205,6 +225,13 @@ class ScaffoldConfig(GRPOConfig):
                 f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
                 f"come from {', '.join(sorted(set(paths))) or 'no module (none calls the model)'}"
             )
+        if self.actor_temperature < 0:
+            raise SpecError(f"actor_temperature is {self.actor_temperature}; expected 0 (greedy) or above")
+        if self.actor_adapter and spec.reflection.name != "retroformer":
+            raise SpecError(
+                f"actor_adapter {self.actor_adapter!r} is the frozen actor beside a trained reflector, but reflection is "
+                f"{spec.reflection.name!r}; to train the actor itself, name its warm start in `adapter`"
+            )
         if spec.sampling.temperature <= 0:
             raise SpecError("agent.sampling.temperature is 0: greedy choices have no gradient; set it above 0")
         if spec.sampling.top_p < 1 or spec.sampling.top_k > 0:
@@ -236,8 +263,23 @@ class ScaffoldConfig(GRPOConfig):
                 f"normalize 'rollout' with loss_type {self.loss_type!r}: its denominator is not the number of trained "
                 f"tokens; use one of {', '.join(EXACT_LOSSES)}"
             )
+        self._check_validation()
         if self.num_generations < 2:
             raise SpecError(f"num_generations is {self.num_generations}: a group needs at least 2 rollouts to compare")
+
+    def _check_validation(self) -> None:
+        """A checkpoint exists of whatever update turns out best."""
+        _ = self.other_specs
+        if not self.validates:
+            return
+        if self.validation_tasks < 1:
+            raise SpecError(f"validation_tasks is {self.validation_tasks}: evaluation while training needs at least 1")
+        saves = getattr(self.save_strategy, "value", self.save_strategy)
+        if saves == "steps" and self.eval_strategy == "steps" and (self.eval_steps or 0) % self.save_steps:
+            raise SpecError(
+                f"eval_steps {self.eval_steps} is no multiple of save_steps {self.save_steps}, so the best update may "
+                "have no checkpoint; make it one, or set `save_strategy: best`"
+            )
 
     def warnings(self) -> list[str]:
         """What a user should know about a configuration that runs."""
@@ -266,6 +308,10 @@ def agent_spec(value: Any) -> AgentSpec:
     if isinstance(value, str):
         return AgentSpec.from_yaml(value)
     return AgentSpec.from_data(value)
+
+
+def _listed(specs: list[Any] | str) -> list[Any]:
+    return [specs] if isinstance(specs, str) else list(specs)
 
 
 def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:

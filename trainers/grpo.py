@@ -9,43 +9,32 @@ in their place: advantages per episode, a fixed number of micro-batches, the den
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate.utils import gather_object
 from torch import nn
-from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, rotate_checkpoints
 from trl import GRPOTrainer
 
-from agentspec.episode import MakeEnv, Runner, make_env
+from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
-from trainers.batches import Row, blank_row, collate, deal, rows_logprobs
+from trainers.batches import ROWS, Row, blank_row, collate, deal, rows_logprobs
+from trainers.call_metrics import CallMetrics, clipped_tokens
 from trainers.config import ScaffoldConfig
-from trainers.resume import (
-    ScaffoldState,
-    last_complete_checkpoint,
-    load_state,
-    restore_finished,
-    rewind_logs,
-    rows_of,
-    save_state,
-    unmark,
-)
-from trainers.rollouts import collect, rollout_jobs
+from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs
+from trainers.rollouts import collect, rollout_jobs, task_of
 from trainers.runlog import RunLog, paths_called, transcript
 from trainers.sequences import build_sequences
 from trainers.tree import enable_tree
+from trainers.validation import validate, validation_scaffolds
 from trainers.weighing import weigh
 
-ROWS = "rows"
-"""Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
 
-
-class ScaffoldGRPOTrainer(GRPOTrainer):
+class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -89,6 +78,7 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         self._llm: LLM | None = None
         self._round = 0
         self._memory: bytes | None = None
+        self._call_metrics = CallMetrics()
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command).
@@ -141,33 +131,39 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
         Returns TRL's tuple: prompt ids, completion ids, tool mask, completions, log-probs, extra fields, images, tool
         images.
         """
-        rows, mode = self._task_rows, "train" if self.model.training else "eval"
-        group = self.num_generations if mode == "train" else self.num_generations_eval
+        rows = self._task_rows
         jobs = rollout_jobs(
             rows,
             seed=self.args.seed,
             round=self._round,
             first=self.accelerator.process_index * len(rows),
-            group=group,
+            group=self.num_generations,
             memory=self._memory,
         )
-        runner = Runner(
-            self.args.spec,
+        self._sync_weights()
+        self._episodes = self._play(jobs)
+        self._log_episodes()
+        self._memory = self._carried_memory()
+        stand_in = [self._tokenizer.pad_token_id]
+        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self._episodes]
+        n = len(self._episodes)
+        return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
+
+    def _runner(self, spec: AgentSpec) -> Runner:
+        """Runs episodes of ``spec`` with the policy as it is."""
+        return Runner(
+            spec,
             self.llm,
             make_env=self._make_env,
             concurrency=self.args.rollout_concurrency or None,
             timeout_s=self.args.env_timeout_s,
             policy=f"step-{self.state.global_step}",
         )
-        self._sync_weights()
-        self._episodes = collect(runner, jobs, retries=self.args.retries, rewards=self.rewards_used)
-        self._log_episodes(mode)
-        if mode == "train":
-            self._memory = self._carried_memory()
-        stand_in = [self._tokenizer.pad_token_id]
-        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self._episodes]
-        n = len(self._episodes)
-        return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
+
+    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
+        """One episode per job, in order, those that failed among them; ``spec``: another than the training scaffold."""
+        runner = self._runner(spec or self.args.spec)
+        return collect(runner, jobs, retries=self.args.retries, rewards=self.rewards_used)
 
     def _sync_weights(self) -> None:
         """Make the backend sample from the weights as they are now."""
@@ -182,25 +178,23 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
 
     def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
         self._task_rows = inputs
-        mode = "train" if self.model.training else "eval"
         super()._generate_and_score_completions(inputs)  # rewards, their logs, and TRL's metrics
-        rows = self._rows(mode)
-        return {ROWS: rows}
+        return {ROWS: self._rows()}
 
-    def _rows(self, mode: str) -> list[Row]:
+    def _rows(self) -> list[Row]:
         """All sequences of this rank's episodes with the advantages of the whole group."""
         weighed = weigh(
             self._episodes,
             self.args,
             self.rewards_used,
-            group=self.num_generations if mode == "train" else self.num_generations_eval,
+            group=self.num_generations,
             rank=self.accelerator.process_index,
             gather=gather_object,
         )
         for name, value in weighed.metrics.items():
-            self._metrics[mode][name].append(value)
+            self._metrics["train"][name].append(value)
         scored = [t for t in self._episodes if t.scorable]
-        if mode == "train" and scored and not any(build_sequences(t, self.args.train_filter) for t in scored):
+        if scored and not any(build_sequences(t, self.args.train_filter) for t in scored):
             raise SpecError(
                 f"no call of this generation batch matched train_calls {self.args.train_calls} with credits "
                 f"{self.args.train_credits}; the scaffold called {sorted(paths_called(self._episodes))}"
@@ -222,9 +216,6 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
 
     def _prepare_inputs(self, generation_batch: Any) -> dict[str, Any]:
         """The next micro-batch; a new generation round when the buffered ones are used up."""
-        if not self.model.training:
-            rows = self._generate_and_score_completions(generation_batch)[ROWS]
-            return self._micro_batches(rows, 1)[0]
         if self._step % self._steps_per_round == 0 or self._buffered_inputs is None:
             self._round = self.state.global_step
             rows = self._generate_and_score_completions(generation_batch)[ROWS]
@@ -301,96 +292,88 @@ class ScaffoldGRPOTrainer(GRPOTrainer):
             return super()._get_per_token_logps_and_entropies(model, *args, **kwargs)
         with self.accelerator.autocast():
             logps, entropies = rows_logprobs(model, inputs[ROWS], skip_silent=self._skip_silent, **self._packing)
-        mode = "train" if self.model.training else "eval"
-        difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * inputs["tool_mask"]
-        self._metrics[mode]["sampling/logp_difference_max"].append(difference.max().item())
+        computed = inputs["tool_mask"]
+        difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * computed
+        self._metrics["train"]["sampling/logp_difference_max"].append(difference.max().item())
+        old = inputs.get("old_per_token_logps", logps).detach()
+        limits = self.loss_type, self.epsilon_low, self.epsilon_high
+        clipped = clipped_tokens((logps.detach() - old).exp(), inputs["advantages"], *limits)
+        self._call_metrics.add(inputs[ROWS], entropies, clipped, computed)
         return logps, entropies, None
-
-    # --- checkpoints ---------------------------------------------------------------------------------------------
-
-    def _save_checkpoint(self, model: nn.Module, trial: Any) -> None:
-        """As TRL's; the main process's state is written last, and older checkpoints go only after that."""
-        run = self._get_output_dir(trial=trial)
-        folder = Path(run) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
-        main = self.accelerator.is_main_process
-        if main:
-            unmark(folder)
-        limit, self.args.save_total_limit = self.args.save_total_limit, None
-        try:
-            super()._save_checkpoint(model, trial)
-        finally:
-            self.args.save_total_limit = limit
-        unused = self._step % self._steps_per_round != 0
-        buffered = rows_of(self._buffered_inputs, ROWS) if unused else ()
-        state = ScaffoldState(self._step, self._round, buffered, self._memory)
-        if not main:
-            save_state(folder, state, self.accelerator.process_index)
-        self.accelerator.wait_for_everyone()
-        if main:
-            save_state(folder, state)
-            best = self.state.best_model_checkpoint
-            rotate_checkpoints(run, save_total_limit=limit, best_model_checkpoint=best, use_mtime=True)
-
-    def _get_train_sampler(self, dataset: Any = None) -> Any:
-        self._task_sampler = super()._get_train_sampler(dataset)
-        return self._task_sampler
-
-    def _load_optimizer_and_scheduler(self, checkpoint: str | None) -> None:
-        super()._load_optimizer_and_scheduler(checkpoint)
-        if checkpoint and self._task_sampler.shuffle:
-            # The sampler draws one order of tasks per epoch; those of finished epochs were drawn before the stop.
-            for _ in range(int((self.state.epoch or 0.0) + 1e-6)):
-                torch.randperm(self._task_sampler.num_samples, generator=self._task_sampler.generator)
-        state = load_state(checkpoint, self.accelerator.process_index) if checkpoint else None
-        if state is None:
-            return
-        self._step, self._round, self._memory = state.step, state.round, state.memory
-        if state.buffered:
-            self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
-        if self.accelerator.is_main_process:
-            rewind_logs(self.run_log, self.state.global_step)
 
     # --- logs --------------------------------------------------------------------------------------------------------
 
-    def _log_episodes(self, mode: str) -> None:
+    def _log_episodes(self) -> None:
         """Scaffold metrics of this rank's episodes, and the trajectories themselves."""
         scored = [t for t in self._episodes if t.scorable]
         for name in ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries"):
             values = [float(t.metrics[name]) for t in scored if name in t.metrics]
             if values:
-                self._metrics[mode][f"episode/{name}"].append(sum(values) / len(values))
-        if mode == "train":
-            self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
+                self._metrics["train"][f"episode/{name}"].append(sum(values) / len(values))
+        self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
         first = self.accelerator.process_index * len(self._episodes)
         receipts = [{**r, "episode": first + r["episode"]} for r in receipt_rows(rows)]
         blank = sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])
-        episodes = [(t.episode, self.rewards_used.total(t)) for t in self._episodes]
-        everyone = {"rows": gather_object(receipts), "blank": gather_object([blank])}
-        played = gather_object(episodes)
-        if not self.accelerator.is_main_process:
-            return
-        self.run_log.append(
-            "updates.jsonl",
-            {
-                "round": self._round,
-                "episodes": [name for name, _ in played],
-                "returns": [value for _, value in played],
-                "rows": everyone["rows"],
-                "blank_rows": sum(everyone["blank"]),
-                "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
-                "estimator": self.args.estimator,
-                "loss_type": self.loss_type,
-            },
-        )
+        played = gather_object([(t.episode, self.rewards_used.total(t)) for t in self._episodes])
+        receipt = {
+            "round": self._round,
+            "episodes": [name for name, _ in played],
+            "returns": [value for _, value in played],
+            "rows": gather_object(receipts),
+            "blank_rows": sum(gather_object([blank])),
+            "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
+            "estimator": self.args.estimator,
+            "loss_type": self.loss_type,
+        }
+        if self.accelerator.is_main_process:
+            self.run_log.append("updates.jsonl", receipt)
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
-        super().log(logs, start_time)
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
-        if self.accelerator.is_main_process and self.model.training and not summary:
-            self.run_log.append("metrics.jsonl", {"step": self.state.global_step, **logs})
+        if self.model.training and not summary:
+            logs |= self._call_metrics.flush(gather_object)
+        super().log(logs, start_time)
+        if self.accelerator.is_main_process and not summary:
+            step, name = self.state.global_step, "metrics.jsonl" if self.model.training else "evaluations.jsonl"
+            if not self.model.training:
+                self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again
+            self.run_log.append(name, {"step": step, **logs})
+
+    def evaluate(
+        self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
+    ) -> dict[str, float]:
+        """Play the validation tasks with the policy as it is; see :mod:`trainers.validation`.
+
+        The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
+        had been evaluated.
+
+        Args:
+            eval_dataset: rows of :func:`~trainers.rollouts.task_rows`; default: the trainer's ``eval_dataset``.
+            ignore_keys: not used (part of the base class's signature).
+            metric_key_prefix: stands before every metric's name.
+        """
+        rows = self.eval_dataset if eval_dataset is None else eval_dataset
+        training = self.model.training
+        self.model.eval()
+        self._sync_weights()
+        metrics = validate(
+            validation_scaffolds(self.args),
+            [Job(task_of(row), 0, self.args.seed, self._memory) for row in rows],
+            lambda spec, jobs: self._play(jobs, spec),
+            self.rewards_used,
+            rank=self.accelerator.process_index,
+            ranks=self.accelerator.num_processes,
+            gather=gather_object,
+        )
+        metrics = {f"{metric_key_prefix}_{name}": value for name, value in metrics.items()}
+        self.log(dict(metrics))
+        control = self.callback_handler.on_evaluate(self.args, self.state, self.control, metrics)  # type: ignore[has-type]
+        self.control = control
+        self.model.train(training)
+        return metrics
 
 
 def local_llm(model: nn.Module, tokenizer: Any) -> LLM:

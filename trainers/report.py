@@ -66,6 +66,16 @@ class TerminalReport(TrainerCallback):
         if self.sample_every and len(self.rewards) % self.sample_every == 1 % self.sample_every:
             self._sample()
 
+    def on_evaluate(self, args: Any, state: Any, control: Any, metrics: dict[str, float], **_: Any) -> None:
+        """One line per scaffold that was validated."""
+        if not state.is_world_process_zero:
+            return
+        for name, value in metrics.items():
+            prefix, found, _rest = name.partition("reward")
+            if found and not _rest:
+                scaffold = prefix.removeprefix("eval_").rstrip("/") or "training scaffold"
+                print(f"  held-out tasks, {scaffold}: reward {value:+.3f}", file=self.stream, flush=True)
+
     def _sample(self) -> None:
         scored = [t for t in self.episodes() if t.scorable]
         if scored:

@@ -14,19 +14,26 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
+from torch import nn
 from transformers import TrainerState
-from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput
+from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotate_checkpoints
 
 from agentspec.registry import SpecError
 from agentspec.state import write_atomic
-from trainers.batches import Row
+from trainers.batches import ROWS, Row
 from trainers.sequences import TokenSequence
+
+if TYPE_CHECKING:
+    from trl import GRPOTrainer as Base
+else:
+    Base = object
 
 FILE = "scaffold_state.json"
 TRAINER_STATE = "trainer_state.json"
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,8 @@ def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None
         return None
     if trainer.is_deepspeed_enabled or trainer.is_fsdp_enabled:
         raise SpecError(f"{checkpoint} is the last of {wanted} steps; export it, or raise max_steps to train on")
-    trainer._load_from_checkpoint(str(checkpoint))
+    best = state.best_model_checkpoint if trainer.args.load_best_model_at_end else None
+    trainer._load_from_checkpoint(str(best or checkpoint))
     trainer.state = state
     return TrainOutput(state.global_step, 0.0, {})
 
@@ -129,12 +137,14 @@ def _name(rank: int) -> str:
 def _row_to_json(row: Row) -> dict[str, Any]:
     data = asdict(row)
     data["sequence"]["allowed"] = [[p, list(ids)] for p, ids in row.sequence.allowed.items()]
+    data["sequence"]["paths"] = list(row.sequence.paths.items())  # JSON has no integer keys
     return data
 
 
 def _row_from_json(data: dict[str, Any]) -> Row:
     fields = dict(data["sequence"])
     fields["allowed"] = {p: tuple(ids) for p, ids in fields["allowed"]}
+    fields["paths"] = dict(fields["paths"])
     advantage = data["advantage"]
     return Row(TokenSequence(**fields), tuple(advantage) if isinstance(advantage, list) else advantage, data["episode"])
 
@@ -143,8 +153,55 @@ def rewind_logs(log: Any, step: int) -> None:
     """Drop what the logs hold beyond checkpoint ``step``: the resumed run writes it again."""
     log.rewind("metrics.jsonl", "step", step)
     log.rewind("updates.jsonl", "round", step - 1)
+    log.rewind("evaluations.jsonl", "step", step)
 
 
-def rows_of(batches: Sequence[dict[str, Any]] | None, key: str) -> tuple[tuple[Row, ...], ...]:
+def rows_of(batches: Sequence[dict[str, Any]] | None) -> tuple[tuple[Row, ...], ...]:
     """The rows of buffered micro-batches."""
-    return tuple(tuple(batch[key]) for batch in batches or ())
+    return tuple(tuple(batch[ROWS]) for batch in batches or ())
+
+
+class ExactResume(Base):
+    """What a trainer saves and loads beyond TRL's; mixed into :class:`~trainers.grpo.ScaffoldGRPOTrainer`."""
+
+    def _save_checkpoint(self, model: nn.Module, trial: Any) -> None:
+        """As TRL's; the main process's state is written last, and older checkpoints go only after that."""
+        run = self._get_output_dir(trial=trial)
+        folder = Path(run) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
+        main = self.accelerator.is_main_process
+        if main:
+            unmark(folder)
+        limit, self.args.save_total_limit = self.args.save_total_limit, None
+        try:
+            super()._save_checkpoint(model, trial)
+        finally:
+            self.args.save_total_limit = limit
+        unused = self._step % self._steps_per_round != 0
+        buffered = rows_of(self._buffered_inputs) if unused else ()
+        state = ScaffoldState(self._step, self._round, buffered, self._memory)
+        if not main:
+            save_state(folder, state, self.accelerator.process_index)
+        self.accelerator.wait_for_everyone()
+        if main:
+            save_state(folder, state)
+            best = self.state.best_model_checkpoint
+            rotate_checkpoints(run, save_total_limit=limit, best_model_checkpoint=best, use_mtime=True)
+
+    def _get_train_sampler(self, dataset: Any = None) -> Any:
+        self._task_sampler = super()._get_train_sampler(dataset)
+        return self._task_sampler
+
+    def _load_optimizer_and_scheduler(self, checkpoint: str | None) -> None:
+        super()._load_optimizer_and_scheduler(checkpoint)
+        if checkpoint and self._task_sampler.shuffle:
+            # The sampler draws one order of tasks per epoch; those of finished epochs were drawn before the stop.
+            for _ in range(int((self.state.epoch or 0.0) + 1e-6)):
+                torch.randperm(self._task_sampler.num_samples, generator=self._task_sampler.generator)
+        state = load_state(checkpoint, self.accelerator.process_index) if checkpoint else None
+        if state is None:
+            return
+        self._step, self._round, self._memory = state.step, state.round, state.memory
+        if state.buffered:
+            self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
+        if self.accelerator.is_main_process:
+            rewind_logs(self.run_log, self.state.global_step)

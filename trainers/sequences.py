@@ -60,7 +60,7 @@ class TokenSequence:
 
     All lists have one entry per token. ``logprobs`` are those of the sampling distribution (0 where ``mask`` is 0),
     ``temperatures`` the sampling temperature, ``calls`` the id of the call that wrote the token (-1: nobody's choice).
-    ``allowed`` maps a position to the ids its constraint left.
+    ``allowed`` maps a position to the ids its constraint left, ``paths`` a call's id to its ``module/purpose``.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -70,6 +70,7 @@ class TokenSequence:
     calls: list[int] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     allowed: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    paths: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -103,6 +104,7 @@ class TokenSequence:
                 f"{len(completion.logprobs)} log-probabilities; training needs a backend that records both"
             )
         allowed = completion.allowed or (None,) * len(ids)
+        self.paths[call.id] = call.tag.path
         for position, (token, logprob, choice) in enumerate(zip(ids, completion.logprobs, allowed, strict=True), start):
             free = choice is None or len(choice) > 1
             self.tokens.append(token)

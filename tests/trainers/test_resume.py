@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
 
 
-def trainer(folder: Path, **changes: Any) -> ScaffoldGRPOTrainer:
+def trainer(folder: Path, *, held_out: Sequence[Task] = (), **changes: Any) -> ScaffoldGRPOTrainer:
     settings: dict[str, Any] = {
         "output_dir": str(folder),
         "agent": {"reasoning": "direct", "sampling": {"max_tokens": 8}},
@@ -51,6 +52,7 @@ def trainer(folder: Path, **changes: Any) -> ScaffoldGRPOTrainer:
         tiny_model(tokenizer),
         ScaffoldConfig(**settings),
         train_dataset=Dataset.from_list(task_rows(tasks)),
+        eval_dataset=Dataset.from_list(task_rows(held_out)) if held_out else None,
         processing_class=tokenizer,
     )
 
@@ -105,7 +107,7 @@ def test_state_round_trip(tmp_path: Path) -> None:
     assert load_state(tmp_path) == state
     assert load_state(tmp_path / "elsewhere") is None
     (tmp_path / "scaffold_state.json").write_text('{"format": 99}')
-    with pytest.raises(ValueError, match="format 99, expected 1"):
+    with pytest.raises(ValueError, match="format 99, expected 2"):
         load_state(tmp_path)
 
 
@@ -133,7 +135,7 @@ def test_a_new_run_in_the_folder_of_an_old_one_starts_new_logs(tmp_path: Path) -
 
 def test_a_checkpoint_is_complete_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever interrupts a save, the checkpoint before is still there and is the one to resume from."""
-    from trainers import grpo as module
+    from trainers import resume as module
     from trainers.resume import last_complete_checkpoint
 
     run = trainer(tmp_path, save_total_limit=1)

@@ -1,0 +1,99 @@
+"""What an update does to each kind of call: which parts of the scaffold reinforcement learning changes.
+
+Trained tokens are counted by the ``module/purpose`` path of the call that wrote them. An update that moves the
+summaries and leaves the actions alone shows here, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+
+from trainers.batches import Row
+
+
+@dataclass
+class CallTotals:
+    """Sums over the trained tokens of one path.
+
+    ``computed`` counts those the update's forward saw: all but those of rows without a gradient, which it may leave
+    out. ``entropy`` (nats) and ``clipped`` are sums over these.
+    """
+
+    tokens: int = 0
+    advantage: float = 0.0
+    computed: int = 0
+    entropy: float = 0.0
+    clipped: int = 0
+
+    def __iadd__(self, other: CallTotals) -> CallTotals:
+        for f in fields(self):
+            setattr(self, f.name, getattr(self, f.name) + getattr(other, f.name))
+        return self
+
+
+class CallMetrics:
+    """Gathers the totals of micro-batches until they are logged."""
+
+    def __init__(self) -> None:
+        self._totals: dict[str, CallTotals] = {}
+
+    def add(self, rows: Sequence[Row], entropies: torch.Tensor, clipped: torch.Tensor, computed: torch.Tensor) -> None:
+        """Count one micro-batch.
+
+        Args:
+            entropies: (B, L-1), nats, aligned with ``completion_ids``.
+            clipped: (B, L-1), whether the loss clipped the token's ratio.
+            computed: (B, L-1), whether the forward computed the token.
+        """
+        for row, entropy, cut, seen in zip(rows, entropies.tolist(), clipped.tolist(), computed.tolist(), strict=True):
+            sequence = row.sequence
+            for place, trained in enumerate(sequence.mask):
+                if not trained:
+                    continue
+                totals = self._totals.setdefault(sequence.paths[sequence.calls[place]], CallTotals())
+                weight = row.advantage if isinstance(row.advantage, int | float) else row.advantage[place]
+                totals.tokens += 1
+                totals.advantage += abs(weight)
+                if seen[place - 1]:
+                    totals.computed += 1
+                    totals.entropy += entropy[place - 1]
+                    totals.clipped += bool(cut[place - 1])
+
+    def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
+        """Metrics of what was counted since the last time, over all ranks.
+
+        Per path: ``tokens`` (trained), ``advantage_mass`` (its share of the sum of absolute advantages over trained
+        tokens), ``entropy`` (mean, nats), ``clip_share`` (of its tokens).
+        """
+        everywhere: dict[str, CallTotals] = {}
+        for path, totals in gather(list(self._totals.items())):
+            everywhere.setdefault(path, CallTotals()).__iadd__(totals)
+        self._totals = {}
+        mass = sum(t.advantage for t in everywhere.values())
+        metrics: dict[str, float] = {}
+        for path, t in sorted(everywhere.items()):
+            metrics[f"calls/{path}/tokens"] = float(t.tokens)
+            metrics[f"calls/{path}/advantage_mass"] = t.advantage / mass if mass else 0.0
+            if t.computed:
+                metrics[f"calls/{path}/entropy"] = t.entropy / t.computed
+                metrics[f"calls/{path}/clip_share"] = t.clipped / t.computed
+        return metrics
+
+
+def clipped_tokens(
+    ratios: torch.Tensor, advantages: torch.Tensor, loss_type: str, low: float, high: float
+) -> torch.Tensor:
+    """Where the loss clips: bool of the shape of ``ratios``; ``advantages`` (B,) or of that shape.
+
+    As in TRL: cispo caps the ratio at ``high`` where the advantage is positive; the others stop the gradient of a ratio
+    outside [1 - low, 1 + high] on the side the advantage pushes to.
+    """
+    if advantages.dim() < ratios.dim():
+        advantages = advantages.unsqueeze(-1)
+    if loss_type == "cispo":
+        return (ratios > high) & (advantages > 0)
+    return ((ratios < 1 - low) & (advantages < 0)) | ((ratios > 1 + high) & (advantages > 0))

@@ -1,0 +1,86 @@
+"""Evaluation while training: held-out tasks under the training scaffold and, by choice, under others.
+
+Tasks come from the validation split, which neither training nor the final evaluation sees: the best checkpoint is
+chosen on them. Every rank plays its share of the tasks; all ranks get the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from agentspec.episode import Job
+from agentspec.spec import AgentSpec
+from agentspec.trajectory import Trajectory
+from rewards import RewardSet
+from trainers.config import ScaffoldConfig
+
+METRICS = (
+    "net_earnings",
+    "success",
+    "deliveries",
+    "steps",
+    "invalid_actions",
+    "llm_calls",
+    "input_tokens",
+    "output_tokens",
+)
+"""Figures of an episode that are logged where the environment or the scaffold reports them."""
+
+
+def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
+    """Scaffold by prefix of its metrics: the training scaffold has none, others ``LABEL/``; greedy by default."""
+    training = config.spec
+    scaffolds = {"": training} | {f"{s.label}/": s for s in config.other_specs if s != training}
+    changes = config.evaluation_sampling
+    return {prefix: replace(s, sampling=replace(s.sampling, **changes)) for prefix, s in scaffolds.items()}
+
+
+def validate(
+    scaffolds: Mapping[str, AgentSpec],
+    jobs: Sequence[Job],
+    play: Callable[[AgentSpec, Sequence[Job]], Sequence[Trajectory]],
+    rewards: RewardSet,
+    *,
+    rank: int = 0,
+    ranks: int = 1,
+    gather: Callable[[list[Any]], list[Any]] = list,
+) -> dict[str, float]:
+    """Mean figures per scaffold over the same tasks.
+
+    Args:
+        scaffolds: by prefix, as of :func:`validation_scaffolds`.
+        jobs: all of them; rank r plays those at r, r + ranks, ...
+        play: scaffold, jobs -> episodes.
+        rewards: what ``reward`` is, as in training.
+        gather: list of this rank -> concatenated lists of all ranks.
+
+    Returns:
+        ``PREFIXreward`` (the training reward per episode), those of :data:`METRICS` that episodes report, and
+        ``PREFIXunscorable``, the share of episodes that failed; means leave these out. ``reward`` is NaN if all failed.
+    """
+    metrics: dict[str, float] = {}
+    for prefix, spec in scaffolds.items():
+        rows = gather([_figures(t, rewards) for t in play(spec, jobs[rank::ranks])])
+        scored = [row for row in rows if row is not None]
+        metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
+        for name in METRICS:
+            values = [row[name] for row in scored if name in row]
+            if values:
+                metrics[f"{prefix}{name}"] = _mean(values)
+        metrics[f"{prefix}unscorable"] = 1 - len(scored) / len(rows)
+    return metrics
+
+
+def _figures(trajectory: Trajectory, rewards: RewardSet) -> dict[str, float] | None:
+    """Numbers of one episode; ``None`` if it cannot be scored."""
+    total = rewards.total(trajectory)
+    if total is None:
+        return None
+    return {"reward": total} | {n: float(trajectory.metrics[n]) for n in METRICS if n in trajectory.metrics}
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values) if values else math.nan
