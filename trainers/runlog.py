@@ -7,6 +7,7 @@
         trajectories/000001.jsonl one file per generation round
         updates.jsonl             one receipt per generation round: rows, tokens, denominators, advantages
         metrics.jsonl             what the trainer logged
+        evaluations.jsonl         what evaluation while training found (eval_strategy: steps)
 """
 
 from __future__ import annotations
