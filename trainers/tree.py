@@ -27,6 +27,7 @@ from torch.utils.checkpoint import checkpoint
 
 from agentspec.registry import SpecError
 from trainers.logprobs import sampled_logprobs
+from trainers.tree_flex import block_mask, flex_tree, subtree_ends, usable
 
 ATTENTION = "agentspec_tree"
 NODE_TOKENS = 512
@@ -56,7 +57,7 @@ class Tree:
     positions: list[int] = field(default_factory=list)
     nodes: list[Node] = field(default_factory=list)
     places: list[list[int]] = field(default_factory=list)
-    masks: dict[tuple[Any, ...], torch.Tensor] = field(default_factory=dict, repr=False)
+    masks: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
 
     @property
     def packing_ratio(self) -> float:
@@ -67,6 +68,15 @@ class Tree:
     def lengths(self) -> list[int]:
         """Tokens per node."""
         return [n.end - n.start for n in self.nodes]
+
+    def block_mask(self, window: int, device: torch.device) -> Any:
+        """FlexAttention's mask, built once per window and update."""
+        key = (window, device)
+        if key not in self.masks:
+            paths = [n.path for n in self.nodes]
+            ends = subtree_ends([n.start for n in self.nodes], [n.end for n in self.nodes], paths)
+            self.masks[key] = block_mask(ends, self.positions, window, device)
+        return self.masks[key]
 
 
 def build_tree(sequences: Sequence[Sequence[int]], node_tokens: int = NODE_TOKENS) -> Tree:
@@ -221,7 +231,7 @@ def tree_attention(
     """Attention along each node's path.
 
     ``query`` (1, heads, N, size), ``key`` and ``value`` (1, kv heads, N, size); returns (1, N, heads, size). Without a
-    tree this is transformers' SDPA.
+    tree this is transformers' SDPA. With one: node by node on a CPU, one kernel (:mod:`trainers.tree_flex`) elsewhere.
     """
     if tree is None:
         from transformers.integrations.sdpa_attention import sdpa_attention_forward
@@ -232,6 +242,9 @@ def tree_attention(
         return output, None
     if kwargs.get("softcap") is not None or kwargs.get("s_aux") is not None:
         raise SpecError("tree packing does not know soft-capped attention or sinks; set `packing: padded`")
+    if usable(query.device, query.dtype):
+        mask = tree.block_mask(sliding_window or 0, query.device)
+        return flex_tree(query, key, value, mask, scaling).transpose(1, 2), None
     # One split per tensor: its backward is one concatenation, where slices would each allocate a full gradient.
     queries = query.split(tree.lengths, dim=2)
     keys, values = key.split(tree.lengths, dim=2), value.split(tree.lengths, dim=2)
@@ -265,7 +278,8 @@ def _mask(tree: Tree, n: int, length: int, window: int, like: torch.Tensor) -> t
         if window:
             hidden |= there <= here - window
         tree.masks[key] = torch.zeros(n, length, dtype=like.dtype, device=like.device).masked_fill_(hidden, -torch.inf)
-    return tree.masks[key]
+    mask: torch.Tensor = tree.masks[key]
+    return mask
 
 
 def _check(model: nn.Module, base: Any) -> None:
