@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eval.statistics import Estimate, bootstrap, paired_difference
+from eval.statistics import Estimate, bootstrap, crossed_bootstrap, paired_difference
 
 
 def test_two_values() -> None:
@@ -64,3 +64,18 @@ def test_refusals() -> None:
 def test_the_interval_lies_within_the_values(values: list[float]) -> None:
     estimate = bootstrap(values, resamples=200)
     assert min(values) - 1e-9 <= estimate.low <= estimate.high <= max(values) + 1e-9
+
+
+def test_crossed_bootstrap_covers_runs_and_tasks() -> None:
+    same = crossed_bootstrap([[1.0, 3.0, 5.0, 7.0]] * 3)
+    tasks_only = bootstrap([1.0, 3.0, 5.0, 7.0])
+    assert same.mean == tasks_only.mean == 4.0
+    assert same.low == pytest.approx(tasks_only.low, abs=0.5) and same.high == pytest.approx(tasks_only.high, abs=0.5)
+    # Runs that differ widen it, though the tasks agree: their mean alone has no spread over tasks.
+    runs = crossed_bootstrap([[0.0] * 4, [10.0] * 4])
+    assert (runs.mean, runs.low, runs.high) == (5.0, 0.0, 10.0)
+    assert bootstrap([5.0] * 4).low == 5.0
+    one = crossed_bootstrap([[1.0, 3.0, 5.0, 7.0]])
+    assert one == tasks_only
+    with pytest.raises(ValueError, match="same tasks for every run"):
+        crossed_bootstrap([[1.0], [1.0, 2.0]])

@@ -1,0 +1,165 @@
+"""Does it learn? Train each recipe with several seeds, then play held-out tasks before and after, under every scaffold.
+
+    python -m recipes.learning_study --configs recipes/configs/study_grpo.yaml recipes/configs/study_supo.yaml \\
+        --seeds 0 1 2 --out runs/study
+
+Every run is a process of its own (``OUT/NAME-sSEED``) and goes on where it stopped; so does the evaluation. What comes
+out: ``study.md`` (gains per training seed and over all of them), ``results.md`` (the whole matrix), ``curves.png``.
+All configs must name the same model, warm start and world: then one starting policy is the baseline of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from recipes.common import parse_config, run_recipe
+
+START = "start"
+
+
+def main() -> None:
+    """Train what is not trained, evaluate what is not evaluated, write the report."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--configs", nargs="+", required=True, help="training configurations, one per method")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="training seeds")
+    parser.add_argument("--out", default="runs/study", help="folder of all runs and of the report")
+    parser.add_argument("--no-train", action="store_true", help="evaluate the runs that are there")
+    options = parser.parse_args()
+    out = Path(options.out)
+    configs = {Path(path).stem: parse_config(["--config", path]) for path in options.configs}
+    check(configs)
+    runs = {name: {seed: out / f"{name}-s{seed}" for seed in options.seeds} for name in configs}
+    if not options.no_train:
+        for path, (_, folders) in zip(options.configs, runs.items(), strict=True):
+            for seed, folder in folders.items():
+                train(path, seed, folder)
+    report(configs, runs, out)
+
+
+def check(configs: Mapping[str, Any]) -> None:
+    """One baseline serves all configurations.
+
+    Raises:
+        SpecError: two of them have the same name, or differ in model, adapter, world or held-out tasks.
+    """
+    from agentspec.registry import SpecError
+
+    first, *others = configs.items()
+    for name, config in others:
+        for field in ("model", "adapter", "environment", "eval_tasks", "eval_sampling"):
+            mine, theirs = getattr(config, field), getattr(first[1], field)
+            if mine != theirs:
+                raise SpecError(
+                    f"{field} is {mine!r} in {name} and {theirs!r} in {first[0]}; a study compares like with like"
+                )
+
+
+def train(path: str, seed: int, folder: Path) -> None:
+    """One training run in a process of its own; a finished one is only loaded.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    command = [sys.executable, "-m", "recipes.grpo_delivery", "--config", path]
+    command += ["--seed", str(seed), "--output_dir", str(folder), "--resume", "true"]
+    print(f"{folder}: {' '.join(command)}", file=sys.stderr, flush=True)
+    if subprocess.run(command, check=False).returncode:
+        raise SystemExit(f"{folder}: training failed (see above); the same command goes on from its last checkpoint")
+
+
+def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], out: Path) -> None:
+    """Play the matrix and write tables and curves."""
+    from agentspec.state import write_atomic
+    from eval.matrix import Policy, evaluate
+    from eval.plots import learning_curves
+    from eval.tables import write_report
+    from trainers.config import agent_spec
+    from trainers.policy import resolve_adapter
+    from trainers.rollouts import make_tasks
+    from trainers.runlog import RunLog
+
+    config = next(iter(configs.values()))
+    name, options = config.world
+    specs = [agent_spec(s) for c in configs.values() for s in (c.spec.to_data(), *(c.eval_specs or []))]
+    start = resolve_adapter(config.adapter) if config.adapter else ""
+    policies = [Policy(START, model=config.model, adapter=start)]
+    for method, folders in runs.items():
+        policies += [Policy(f"{method}-s{seed}", config.model, str(folder)) for seed, folder in folders.items()]
+    policies += [Policy("rule_based"), Policy("random")]
+    rows = evaluate(
+        policies,
+        {s.label: s for s in specs},
+        make_tasks(name, options, config.eval_tasks, split="test"),
+        out=out,
+        sampling=config.evaluation_sampling,
+        on_row=lambda row: print(row["policy"], row["scaffold"], row["task"], row.get("return"), file=sys.stderr),
+    )
+    write_report(rows, out)
+    own = {method: c.spec.label for method, c in configs.items()}
+    write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
+    logs = {m: [RunLog(f).read("metrics.jsonl") for f in folders.values()] for m, folders in runs.items()}
+    learning_curves(logs, out / "curves.png")
+    print((out / "study.md").read_text())
+
+
+def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]], own: Mapping[str, str]) -> str:
+    """Markdown: what each training run gained over the start, on the same tasks, under every scaffold.
+
+    Args:
+        rows: of the evaluation.
+        seeds: method -> training seeds.
+        own: method -> label of the scaffold it was trained in.
+    """
+    from eval.metrics import BY_NAME, primary_metric
+    from eval.statistics import bootstrap, crossed_bootstrap
+    from eval.tables import show, table, values_by_task
+
+    metric = primary_metric(list(rows))
+    digits = BY_NAME[metric].digits
+    scaffolds = list(dict.fromkeys(row["scaffold"] for row in rows))
+    cells = {
+        (policy, s): values_by_task([r for r in rows if (r["policy"], r["scaffold"]) == (policy, s)], metric)
+        for policy in dict.fromkeys(row["policy"] for row in rows)
+        for s in scaffolds
+    }
+    body = []
+    for method, numbers in seeds.items():
+        for scaffold in scaffolds:
+            policies = [f"{method}-s{n}" for n in numbers]
+            held = [cells[p, scaffold] for p in (START, *policies)]
+            tasks = [t for t in held[0] if all(t in values for values in held)]
+            gained = [[values[t] - held[0][t] for t in tasks] for values in held[1:]]
+            before = bootstrap([held[0][t] for t in tasks])
+            after = crossed_bootstrap([[values[t] for t in tasks] for values in held[1:]])
+            where = f"{scaffold} (its own)" if scaffold == own[method] else scaffold
+            each = ", ".join(show(bootstrap(g), digits) for g in gained)
+            pooled = show(crossed_bootstrap(gained), digits)
+            body.append([method, where, show(before, digits), show(after, digits), pooled, each, str(len(tasks))])
+    header = [
+        "trained with",
+        "evaluated in",
+        "before",
+        "after (all seeds)",
+        "gain (all seeds)",
+        "gain per seed",
+        "tasks",
+    ]
+    lines = [
+        f"# {BY_NAME[metric].heading} before and after training",
+        "",
+        "Greedy, on held-out tasks, paired by task. Intervals: 95 % bootstrap; per seed over tasks, for all seeds over",
+        "training seeds and tasks together. An interval that contains 0 is a tie.",
+        "",
+        *table(header, body),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    run_recipe(main)
