@@ -229,7 +229,12 @@ class Runner:
         metrics = {**jsonable(info.get("metrics", {})), **_scaffold_metrics(transitions, agent.recorder, ended)}
         trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         if status == "completed":
-            await agent.end_episode(trajectory)
+            try:
+                await agent.end_episode(trajectory)
+            except ContextOverflowError as caught:
+                error = str(caught)  # too long to be reflected on; what was played stands
+            except LLMError as caught:
+                status, error, ended = "failed", str(caught), "failure"
             metrics |= _scaffold_metrics(transitions, agent.recorder, ended) | jsonable(agent.metrics())
             trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         return trajectory

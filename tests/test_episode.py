@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from agentspec.episode import Job, Runner, make_env
-from agentspec.llm.base import LLMError
+from agentspec.llm.base import ContextOverflowError, LLMError
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -151,3 +151,26 @@ def test_shared_prefix(a: tuple[int, ...], b: tuple[int, ...], length: int) -> N
     from agentspec.tokens import shared_prefix
 
     assert shared_prefix(a, b) == length == shared_prefix(b, a)
+
+
+@pytest.mark.parametrize("fault", ["model", "context"])
+def test_a_reflection_that_fails_touches_its_own_episode_only(fault: str) -> None:
+    """The model may fail, or the trial be too long, when the episode has already ended."""
+
+    def script(request) -> str:
+        if request.tag.purpose != "reflect":
+            return "WAIT()"
+        if request.seed % 2:
+            return "Sell when the price is high."
+        if fault == "model":
+            raise LLMError("no answer from the model")
+        raise ContextOverflowError("the trial is too long")
+
+    spec = AgentSpec.from_data({"reasoning": "direct", "reflection": {"name": "reflexion", "threshold": 100.0}})
+    played = Runner(spec, ScriptedLLM(script)).run([Job(Task(TOY, seed)) for seed in range(12)])
+    wrote = [any(c.tag.purpose == "reflect" for c in t.calls) for t in played]
+    assert any(wrote) and not all(wrote)
+    for trajectory, lesson in zip(played, wrote, strict=True):
+        assert trajectory.scorable == (lesson or fault == "context")
+        assert bool(trajectory.error) != lesson
+        assert trajectory.transitions
