@@ -19,6 +19,7 @@ from agentspec.spec import MODULE_KINDS, AgentSpec, load_yaml
 from rewards import RewardSet
 from trainers.advantages import ESTIMATORS
 from trainers.sequences import TrainFilter, unmatched_patterns
+from trainers.vllm import check_vllm
 
 EXACT_LOSSES = ("dapo", "cispo")
 """Loss types normalised by all trained tokens of the update: the same objective however many rows an episode has."""
@@ -79,6 +80,9 @@ class ScaffoldConfig(GRPOConfig):
         lora_alpha: scale of the adapter (0: twice the rank).
         lora_targets: module names that carry LoRA (``all-linear`` or a list).
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
+        vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
+            trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
+            (``token_mask``); both need ``vllm_importance_sampling_correction``.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
@@ -118,6 +122,10 @@ class ScaffoldConfig(GRPOConfig):
     lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
     lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
     lora_layers: int = field(default=0, metadata={"help": "top layers that carry LoRA; 0: all"})
+    # TRL's default weighs whole rows.
+    vllm_importance_sampling_mode: str = field(
+        default="token_truncate", metadata={"help": "token_truncate or token_mask"}
+    )
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})
@@ -196,6 +204,7 @@ class ScaffoldConfig(GRPOConfig):
         self._check_names()
         self._check_calls()
         self._check_exact()
+        check_vllm(self)
 
     def _check_names(self) -> None:
         """Every name among its alternatives."""
@@ -227,11 +236,6 @@ class ScaffoldConfig(GRPOConfig):
             )
         if self.actor_temperature < 0:
             raise SpecError(f"actor_temperature is {self.actor_temperature}; expected 0 (greedy) or above")
-        if self.actor_adapter and spec.reflection.name != "retroformer":
-            raise SpecError(
-                f"actor_adapter {self.actor_adapter!r} is the frozen actor beside a trained reflector, but reflection is "
-                f"{spec.reflection.name!r}; to train the actor itself, name its warm start in `adapter`"
-            )
         if spec.sampling.temperature <= 0:
             raise SpecError("agent.sampling.temperature is 0: greedy choices have no gradient; set it above 0")
         if spec.sampling.top_p < 1 or spec.sampling.top_k > 0:

@@ -8,7 +8,8 @@ in their place: advantages per episode, a fixed number of micro-batches, the den
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -18,23 +19,23 @@ from trl import GRPOTrainer
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
-from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
 from trainers.batches import ROWS, Row, blank_row, collate, deal, rows_logprobs
 from trainers.call_metrics import CallMetrics, clipped_tokens
 from trainers.config import ScaffoldConfig
-from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs
+from trainers.distributed import KnownLayout, check_trained
+from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
 from trainers.rollouts import collect, rollout_jobs, task_of
-from trainers.runlog import RunLog, paths_called, transcript
-from trainers.sequences import build_sequences
+from trainers.runlog import RunLog, transcript
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
+from trainers.vllm import importance_ratio, vllm_round
 from trainers.weighing import weigh
 
 
-class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -88,12 +89,16 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
         if resume_from_checkpoint is True:
             resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
         if self.accelerator.is_main_process:
+            if not resume_from_checkpoint:
+                set_aside(self.args.output_dir)
             config, spec = self.args.to_dict(), self.args.spec.to_data()
             self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
             if not resume_from_checkpoint:
                 rewind_logs(self.run_log, 0)  # of a run that ended before its first checkpoint, say
         finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
-        return finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
+        finished = finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
+        self._last_loaded_step = -1  # the weights may now be those of the best checkpoint
+        return finished
 
     @property
     def last_episodes(self) -> list[Trajectory]:
@@ -106,11 +111,9 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
     def llm(self) -> LLM:
         """The backend that samples from the live policy."""
         if self._llm is None and self.use_vllm:
-            from agentspec.llm.vllm import VLLMBackend, colocated, server
+            from agentspec.llm.vllm import trl_backend
 
-            engine = (server if self.vllm_mode == "server" else colocated)(self.vllm_generation)
-            length = self.args.vllm_max_model_length or self.model.config.max_position_embeddings
-            self._llm = VLLMBackend(engine, self.processing_class, max_context=length)
+            self._llm = trl_backend(self.vllm_generation, self.processing_class)
         if self._llm is None:
             self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
         return self._llm
@@ -140,8 +143,8 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
             group=self.num_generations,
             memory=self._memory,
         )
-        self._sync_weights()
-        self._episodes = self._play(jobs)
+        with self._current_weights():
+            self._episodes = self._play(jobs)
         self._log_episodes()
         self._memory = self._carried_memory()
         stand_in = [self._tokenizer.pad_token_id]
@@ -165,20 +168,27 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
         runner = self._runner(spec or self.args.spec)
         return collect(runner, jobs, retries=self.args.retries, rewards=self.rewards_used)
 
-    def _sync_weights(self) -> None:
-        """Make the backend sample from the weights as they are now."""
+    @contextmanager
+    def _current_weights(self) -> Iterator[None]:
+        """Inside this block the backend samples from the weights as they are now."""
         if self.use_vllm:
-            if self.state.global_step != self._last_loaded_step:
-                self.vllm_generation.sync_weights()
-                self._last_loaded_step = self.state.global_step
+            stale = self.state.global_step != self._last_loaded_step
+            self._last_loaded_step = self.state.global_step
+            with vllm_round(self.vllm_generation, stale=stale):
+                yield
             return
         invalidate = getattr(self.llm, "invalidate", None)
         if invalidate is not None:
             invalidate()
+        yield
 
     def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
         self._task_rows = inputs
-        super()._generate_and_score_completions(inputs)  # rewards, their logs, and TRL's metrics
+        self.vllm_importance_sampling_correction = False  # of the rows, not of TRL's stand-ins for episodes
+        try:
+            super()._generate_and_score_completions(inputs)  # rewards, their logs, and TRL's metrics
+        finally:
+            self.vllm_importance_sampling_correction = self.args.vllm_importance_sampling_correction
         return {ROWS: self._rows()}
 
     def _rows(self) -> list[Row]:
@@ -193,12 +203,7 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
         )
         for name, value in weighed.metrics.items():
             self._metrics["train"][name].append(value)
-        scored = [t for t in self._episodes if t.scorable]
-        if scored and not any(build_sequences(t, self.args.train_filter) for t in scored):
-            raise SpecError(
-                f"no call of this generation batch matched train_calls {self.args.train_calls} with credits "
-                f"{self.args.train_credits}; the scaffold called {sorted(paths_called(self._episodes))}"
-            )
+        check_trained(self._episodes, self.args, gather_object)
         return weighed.rows
 
     def _carried_memory(self) -> bytes | None:
@@ -299,6 +304,13 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
         limits = self.loss_type, self.epsilon_low, self.epsilon_high
         clipped = clipped_tokens((logps.detach() - old).exp(), inputs["advantages"], *limits)
         self._call_metrics.add(inputs[ROWS], entropies, clipped, computed)
+        if self.use_vllm and self.vllm_importance_sampling_correction:
+            # Where the recorded log-probabilities are the old ones, the ratio starts from what vLLM sampled already.
+            current = old if "old_per_token_logps" in inputs else logps
+            bounds = self.vllm_importance_sampling_clip_min, self.vllm_importance_sampling_clip_max
+            inputs["importance_sampling_ratio"] = importance_ratio(
+                current, inputs["sampled_logprobs"], computed, self.vllm_importance_sampling_mode, *bounds
+            )
         return logps, entropies, None
 
     # --- logs --------------------------------------------------------------------------------------------------------
@@ -358,16 +370,16 @@ class ScaffoldGRPOTrainer(ExactResume, GRPOTrainer):
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
         training = self.model.training
         self.model.eval()
-        self._sync_weights()
-        metrics = validate(
-            validation_scaffolds(self.args),
-            [Job(task_of(row), 0, self.args.seed, self._memory) for row in rows],
-            lambda spec, jobs: self._play(jobs, spec),
-            self.rewards_used,
-            rank=self.accelerator.process_index,
-            ranks=self.accelerator.num_processes,
-            gather=gather_object,
-        )
+        with self._current_weights():
+            metrics = validate(
+                validation_scaffolds(self.args),
+                [Job(task_of(row), 0, self.args.seed, self._memory) for row in rows],
+                lambda spec, jobs: self._play(jobs, spec),
+                self.rewards_used,
+                rank=self.accelerator.process_index,
+                ranks=self.accelerator.num_processes,
+                gather=gather_object,
+            )
         metrics = {f"{metric_key_prefix}_{name}": value for name, value in metrics.items()}
         self.log(dict(metrics))
         control = self.callback_handler.on_evaluate(self.args, self.state, self.control, metrics)  # type: ignore[has-type]

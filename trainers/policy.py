@@ -1,7 +1,13 @@
-"""The policy to train: a base model from the resolver, with a LoRA adapter, new or warm-started."""
+"""The policy to train: a base model from the resolver, with a LoRA adapter, new or warm-started; or with two of them.
+
+The adapter under training is always PEFT's ``default`` one, so that saving, resuming and exporting find it where they
+look; a second, frozen one lies in a folder of its own name beside it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +18,9 @@ from agentspec.llm.base import LLMError
 from agentspec.registry import SpecError
 from trainers.config import ScaffoldConfig
 
+TRAINED, ACTOR = "default", "actor"
+"""Names of the adapter that is trained, and of the frozen one that acts beside a trained reflector."""
+
 
 def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
     """Model and tokenizer of ``config``.
@@ -21,35 +30,105 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
 
     Raises:
         LLMError: the model or adapter cannot be found.
-        SpecError: an adapter together with ``lora_r: 0``.
+        SpecError: an adapter together with ``lora_r: 0``, or one of a frozen actor.
     """
-    from peft import LoraConfig, PeftModel, get_peft_model
+    from peft import PeftModel, get_peft_model
+
+    if config.actor_adapter:
+        raise SpecError(
+            f"actor_adapter {config.actor_adapter!r} is a frozen actor beside a trained reflector, and none is trained "
+            "here; name it in `adapter` to train it, or use recipes/retroformer_delivery.py"
+        )
+    if config.adapter and config.lora_r == 0:
+        raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
+    adapter = resolve_adapter(config.adapter) if config.adapter else ""
+    model, tokenizer, path = _load_base(config)
+    if adapter:
+        with _loading(adapter):
+            policy = PeftModel.from_pretrained(model, adapter, is_trainable=True)
+        return _named(policy, path), tokenizer
+    if config.lora_r == 0:
+        return model, tokenizer
+    lora = _new_lora(model, config)
+    torch.manual_seed(config.seed)
+    return get_peft_model(model, lora), tokenizer
+
+
+def load_actor_and_reflector(config: ScaffoldConfig, run: str | Path = "") -> tuple[nn.Module, Any]:
+    """One base with two adapters, and the tokenizer: the actor's, frozen, and the reflector's, active and trainable.
+
+    Args:
+        config: ``actor_adapter`` is the actor's (empty: the actor is the base model), ``adapter`` what the reflector
+            starts from (empty: a new LoRA, which says what the base model says).
+        run: folder of a training run or of its checkpoint: both adapters come from there.
+
+    Raises:
+        LLMError: the model or an adapter cannot be found.
+    """
+    from peft import PeftModel, get_peft_model
+
+    actor, reflector = config.actor_adapter, config.adapter
+    if run:
+        actor, reflector = str(Path(run) / ACTOR), str(run)
+    found = [resolve_adapter(name) if name else "" for name in (actor, reflector)]
+    model, tokenizer, path = _load_base(config)
+    new = [_new_lora(model, config) for _ in found]
+    torch.manual_seed(config.seed)
+    if found[0]:
+        with _loading(found[0]):
+            policy = PeftModel.from_pretrained(model, found[0], adapter_name=ACTOR, is_trainable=False)
+    else:
+        # A LoRA that nobody trains adds nothing: the base model, under a name that calls can be routed to.
+        policy = get_peft_model(model, new[0], adapter_name=ACTOR)
+    if found[1]:
+        with _loading(found[1]):
+            policy.load_adapter(found[1], TRAINED, is_trainable=True)
+    else:
+        policy.add_adapter(TRAINED, new[1])
+    policy.set_adapter(TRAINED)  # which also freezes the other one
+    return _named(policy, path), tokenizer
+
+
+def _load_base(config: ScaffoldConfig) -> tuple[nn.Module, Any, str]:
+    """Model, tokenizer and where they came from."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     from agentspec.llm.models import resolve
 
-    if config.adapter and config.lora_r == 0:
-        raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
-    adapter = resolve_adapter(config.adapter) if config.adapter else ""
-    source = resolve(config.model)
+    path = resolve(config.model).path
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
-    tokenizer = AutoTokenizer.from_pretrained(source.path)
-    model = AutoModelForCausalLM.from_pretrained(source.path, dtype=dtype)
-    if adapter:
-        try:
-            policy = PeftModel.from_pretrained(model, adapter, is_trainable=True)
-            # A shipped adapter names its base by alias; what is saved must name what PEFT itself can find.
-            policy.peft_config["default"].base_model_name_or_path = str(source.path)
-            return policy, tokenizer
-        except (OSError, ValueError) as error:
-            raise LLMError(f"adapter {config.adapter!r} cannot be loaded: {error}") from error
-    if config.lora_r == 0:
-        return model, tokenizer
+    return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
+
+
+@contextmanager
+def _loading(adapter: str) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise LLMError(f"adapter {adapter!r} cannot be loaded: {error}") from error
+
+
+def _named(policy: Any, path: str) -> nn.Module:
+    """A shipped adapter names its base by alias; what is saved must name what PEFT itself can find."""
+    for config in policy.peft_config.values():
+        config.base_model_name_or_path = path
+    model: nn.Module = policy
+    return model
+
+
+def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
+    """Configuration of a new adapter for ``model``.
+
+    Raises:
+        SpecError: more layers than the model has.
+    """
+    from peft import LoraConfig
+
     layers = model.config.get_text_config().num_hidden_layers
     if not 0 <= config.lora_layers <= layers:
         raise SpecError(f"lora_layers is {config.lora_layers}; {config.model} has {layers} layers (0 means all)")
     top = list(range(layers - config.lora_layers, layers)) if config.lora_layers else None
-    lora = LoraConfig(
+    return LoraConfig(
         layers_to_transform=top,
         r=config.lora_r,
         lora_alpha=config.lora_alpha or 2 * config.lora_r,
@@ -57,8 +136,6 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
         lora_dropout=0.0,  # dropout would make the update's log-probabilities differ from the sampled ones
         task_type="CAUSAL_LM",
     )
-    torch.manual_seed(config.seed)
-    return get_peft_model(model, lora), tokenizer
 
 
 def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:

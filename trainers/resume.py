@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,6 +34,9 @@ else:
 
 FILE = "scaffold_state.json"
 TRAINER_STATE = "trainer_state.json"
+EARLIER = "earlier"
+"""Folder of a run that holds the checkpoints of runs that were in its place before."""
+
 FORMAT = 2
 
 
@@ -70,8 +74,8 @@ def unmark(folder: str | Path) -> None:
     (Path(folder) / FILE).unlink(missing_ok=True)
 
 
-def last_complete_checkpoint(folder: str | Path) -> Path | None:
-    """The newest checkpoint of a run that was written to its end; ``None`` if there is none.
+def checkpoints(folder: str | Path) -> list[Path]:
+    """The checkpoints of a run that were written to their end, oldest first.
 
     A run that was killed while saving leaves a folder without its last file, or (rotation cut short) without its
     trainer state; both are passed over.
@@ -81,8 +85,34 @@ def last_complete_checkpoint(folder: str | Path) -> Path | None:
         for path in Path(folder).glob(f"{PREFIX_CHECKPOINT_DIR}-*")
         if (number := path.name.rpartition("-")[2]).isdigit()
     ]
-    complete = [(n, p) for n, p in found if (p / FILE).is_file() and (p / TRAINER_STATE).is_file()]
-    return max(complete)[1] if complete else None
+    return [p for _, p in sorted(found) if (p / FILE).is_file() and (p / TRAINER_STATE).is_file()]
+
+
+def last_complete_checkpoint(folder: str | Path) -> Path | None:
+    """The newest of :func:`checkpoints`; ``None`` if there is none."""
+    return next(reversed(checkpoints(folder)), None)
+
+
+def set_aside(folder: str | Path) -> Path | None:
+    """Move the checkpoints of an earlier run into ``folder/earlier/N``, before a new run begins in ``folder``.
+
+    Otherwise a new run that is killed before its first checkpoint would resume from one of the earlier run, and its
+    rotation would delete them.
+
+    Returns:
+        where they are now; ``None`` if there were none.
+    """
+    found = checkpoints(folder)
+    if not found:
+        return None
+    earlier = Path(folder) / EARLIER
+    taken = [int(p.name) for p in earlier.glob("*") if p.name.isdigit()]
+    place = earlier / str(max(taken, default=0) + 1)
+    place.mkdir(parents=True)
+    for checkpoint in found:
+        checkpoint.rename(place / checkpoint.name)
+    print(f"note: a new run begins in {folder}; the checkpoints of the earlier one are in {place}", file=sys.stderr)
+    return place
 
 
 def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None:

@@ -18,7 +18,7 @@ import functools
 import types
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -139,8 +139,7 @@ class Wanted:
     allowed: tuple[tuple[int, ...] | None, ...]
 
 
-@dataclass(frozen=True)
-class TreeOutput:
+class TreeOutput(NamedTuple):
     """Log-probabilities (with gradient) and entropies of the wanted tokens, both (K,), float32."""
 
     log_probs: torch.Tensor
@@ -160,6 +159,7 @@ def enable_tree(model: nn.Module) -> None:
     if getattr(base, "_agentspec_tree", False):
         return
     _register(base)
+    _enable_head(base)
     original = base.forward
 
     @functools.wraps(type(base).forward)
@@ -171,36 +171,47 @@ def enable_tree(model: nn.Module) -> None:
         # A four-dimensional mask is passed on untouched: no (N, N) mask is built, and ours does not read it.
         nothing = torch.empty(1, 1, 1, 1, device=wanted.before.device)
         hidden = self.base_model(*args, attention_mask=nothing, use_cache=False, tree=tree, **kwargs)
-        return _head(self, hidden.last_hidden_state[0], wanted)
+        output: TreeOutput = self.get_output_embeddings()(hidden.last_hidden_state[0][wanted.before], wanted=wanted)
+        return output
 
     base.forward = types.MethodType(forward, base)
     base._agentspec_tree = True
     _check(model, base)
 
 
-def _head(model: Any, hidden: torch.Tensor, wanted: Wanted) -> TreeOutput:
-    """Project wanted places on the vocabulary, chunk by chunk; chunks after the first are recomputed backward."""
+def _enable_head(model: Any) -> None:
+    """Teach the output projection to give log-probabilities: ``head(states, wanted=Wanted)``, states (K, hidden).
+
+    The vocabulary is projected on chunk by chunk, chunks being recomputed backward, but within one call of the module:
+    where weights are sharded, each call is an event that all ranks must have the same number of.
+    """
     head, text = model.get_output_embeddings(), model.config.get_text_config()
     scale = float(getattr(text, "logit_scale", None) or 1.0) / float(getattr(text, "logits_scaling", None) or 1.0)
     cap = getattr(text, "final_logit_softcapping", None)
+    original = head.forward
 
-    def project(states: torch.Tensor, start: int, stop: int) -> tuple[torch.Tensor, torch.Tensor]:
-        logits = head(states) * scale if scale != 1.0 else head(states)
+    def project(states: torch.Tensor, wanted: Wanted, start: int, stop: int) -> tuple[torch.Tensor, torch.Tensor]:
+        logits = original(states) * scale if scale != 1.0 else original(states)
         if cap:
             logits = torch.tanh(logits / cap) * cap
         part = slice(start, stop)
         return sampled_logprobs(logits, wanted.tokens[part], wanted.temperatures[part], wanted.allowed[part])
 
-    states = hidden[wanted.before]
-    count = states.shape[0]
-    results = []
-    for start in range(0, count, HEAD_CHUNK):
-        arguments = (states[start : start + HEAD_CHUNK], start, min(start + HEAD_CHUNK, count))
-        if count > HEAD_CHUNK and torch.is_grad_enabled():
-            results.append(checkpoint(project, *arguments, use_reentrant=False))
-        else:
-            results.append(project(*arguments))
-    return TreeOutput(torch.cat([r[0] for r in results]), torch.cat([r[1].detach() for r in results]))
+    @functools.wraps(type(head).forward)
+    def forward(self: Any, states: torch.Tensor, *args: Any, wanted: Wanted | None = None, **kwargs: Any) -> Any:
+        if wanted is None:
+            return original(states, *args, **kwargs)
+        count = states.shape[0]
+        results = []
+        for start in range(0, count, HEAD_CHUNK):
+            chunk = (states[start : start + HEAD_CHUNK], wanted, start, min(start + HEAD_CHUNK, count))
+            if count > HEAD_CHUNK and torch.is_grad_enabled():
+                results.append(checkpoint(project, *chunk, use_reentrant=False))
+            else:
+                results.append(project(*chunk))
+        return TreeOutput(torch.cat([r[0] for r in results]), torch.cat([r[1].detach() for r in results]))
+
+    head.forward = types.MethodType(forward, head)
 
 
 def _register(base: Any) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +30,9 @@ class Sampled:
     finish_reason: str
 
 
+REQUESTS = 64
+"""Most requests to a server at once: as many connections as TRL's client keeps."""
+
 Engine = Callable[[Sequence[Sequence[int]], Sequence[Sampling], Sequence[int]], list[list[Sampled]]]
 """prompts, sampling parameters and seeds, one each -> samples of each prompt."""
 
@@ -45,7 +49,7 @@ class VLLMBackend:
     """An :class:`~agentspec.llm.base.LLM` over a vLLM engine.
 
     Args:
-        engine: see :data:`Engine`; :func:`colocated` and :func:`server` make one of TRL's.
+        engine: see :data:`Engine`; :func:`trl_backend` makes one of TRL's.
         tokenizer: the policy's.
         max_context: longest prompt plus answer.
     """
@@ -101,14 +105,48 @@ class VLLMBackend:
         self._batcher.leave(episode)
 
 
+def trl_backend(generation: Any, tokenizer: Any) -> VLLMBackend:
+    """The backend over TRL's ``VLLMGeneration``, in either of its modes.
+
+    With a server, TRL gives only the main process a client, which also pushes the weights; the other processes ask
+    through clients of their own.
+
+    Raises:
+        LLMError: the server reports log-probabilities that are not those it samples from.
+    """
+    if generation.mode == "colocate":
+        limit = generation.llm.llm_engine.model_config.max_model_len
+        return VLLMBackend(colocated(generation), tokenizer, max_context=limit)
+    client = getattr(generation, "vllm_client", None) or _client(generation)
+    model = client.get_server_info()["model_config"]
+    if model["logprobs_mode"] != "processed_logprobs":
+        raise LLMError(
+            f"the vLLM server runs with --logprobs-mode {model['logprobs_mode']}: its log-probabilities are not those "
+            "it samples from; start it with --logprobs-mode processed_logprobs"
+        )
+    return VLLMBackend(server(client), tokenizer, max_context=model["max_model_len"])
+
+
+def _client(generation: Any) -> Any:
+    """A client that only asks: it takes no part in pushing weights."""
+    from trl.generation.vllm_client import VLLMClient
+
+    url = generation.server_base_url or f"http://{generation.server_host}:{generation.server_port}"
+    return VLLMClient(base_url=url, connection_timeout=generation.server_timeout)
+
+
 def colocated(generation: Any) -> Engine:
     """The engine inside this process (``vllm_mode: colocate``), of TRL's ``VLLMGeneration``."""
 
     def run(
         prompts: Sequence[Sequence[int]], sampling: Sequence[Sampling], seeds: Sequence[int]
     ) -> list[list[Sampled]]:
+        import torch
         from vllm import SamplingParams
 
+        device = generation.accelerator.device
+        if device.type == "cuda":
+            torch.cuda.set_device(device)  # a property of the thread, and this is not the trainer's
         parameters = [
             SamplingParams(
                 n=s.n,
@@ -136,31 +174,36 @@ def _from_output(sample: Any) -> Sampled:
     return Sampled(ids, logprobs, "length" if sample.finish_reason == "length" else "stop")
 
 
-def server(generation: Any) -> Engine:
-    """TRL's vLLM server (``vllm_mode: server``): one request per distinct set of sampling parameters."""
+def server(client: Any) -> Engine:
+    """TRL's vLLM server (``vllm_mode: server``): one request per prompt, all at once, each with its own seed."""
+
+    def ask(prompt: Sequence[int], sampling: Sampling, seed: int) -> list[Sampled]:
+        output = client.generate(
+            [list(prompt)],
+            n=sampling.n,
+            temperature=sampling.temperature,
+            top_p=sampling.top_p,
+            top_k=sampling.top_k,
+            max_tokens=sampling.max_tokens,
+            logprobs=0,
+            generation_kwargs={
+                "stop": list(sampling.stop),
+                "include_stop_str_in_output": True,
+                "seed": seed % 2**31,
+            },
+        )
+        samples = []
+        parts = (output[name] for name in ("completion_ids", "logprob_token_ids", "logprobs"))
+        for ids, tokens, logprobs in zip(*parts, strict=True):
+            own = (v[t.index(i)] for i, t, v in zip(ids, tokens, logprobs, strict=True))
+            reason = "length" if len(ids) >= sampling.max_tokens else "stop"
+            samples.append(Sampled(tuple(ids), tuple(map(float, own)), reason))
+        return samples
 
     def run(
         prompts: Sequence[Sequence[int]], sampling: Sequence[Sampling], seeds: Sequence[int]
     ) -> list[list[Sampled]]:
-        results: list[list[Sampled]] = [[] for _ in prompts]
-        for kind in dict.fromkeys(sampling):
-            members = [i for i, s in enumerate(sampling) if s == kind]
-            output = generation.vllm_client.generate(
-                [list(prompts[i]) for i in members],
-                n=kind.n,
-                temperature=kind.temperature,
-                top_p=kind.top_p,
-                top_k=kind.top_k,
-                max_tokens=kind.max_tokens,
-                logprobs=0,
-                generation_kwargs={"stop": list(kind.stop), "include_stop_str_in_output": True},
-            )
-            for place, i in enumerate(members):
-                for sample in range(place * kind.n, (place + 1) * kind.n):
-                    ids = tuple(output["completion_ids"][sample])
-                    values = tuple(float(v[0]) for v in output["logprobs"][sample])
-                    reason = "length" if len(ids) >= kind.max_tokens else "stop"
-                    results[i].append(Sampled(ids, values, reason))
-        return results
+        with ThreadPoolExecutor(min(len(prompts), REQUESTS)) as pool:
+            return list(pool.map(ask, prompts, sampling, seeds))
 
     return run

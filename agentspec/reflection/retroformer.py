@@ -7,27 +7,44 @@ is paid the change of return it brought, ``G(next trial) - G(this trial)``.
 *As it comes the reflector is untrained*: it is the policy's own weights, and the module measures what training needs.
 The call that writes a lesson is tagged ``reflection.retroformer/reflect`` and credited as executed; its reward is known
 one trial later and is recorded in *that* trial's metrics (``reflection/reward`` and whose call it pays).
-:func:`reflection_samples` joins the two: prompt and completion from the trial that was reflected on, reward from the
-next. A trainer optimises these calls alone (``train_calls: [reflection.retroformer/reflect]``, a reflector adapter
-beside a frozen actor adapter); samples of one ``group`` reflect on the same failed trial and are each followed by a
-trial of their own, so their rewards compare like with like.
+:func:`reflection_samples` joins the two. Samples of one ``group`` reflect on the same failed trial and are each
+followed by a trial of their own, so their rewards compare like with like.
+
+``when`` says in which of the two trials the lesson is written: at the ``end`` of the failed one, or at the ``start`` of
+the next. What the reflector reads is the same. With ``start`` a lesson and the trial that pays it are one episode, so
+that many lessons can be drawn from the memory that one failed trial left: :mod:`trainers.retroformer` trains on these.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from agentspec.llm.base import ContextOverflowError, system, user
+from agentspec.llm.recorder import BudgetExceededError
 from agentspec.protocols import Services
-from agentspec.reflection.reflexion import Reflexion
-from agentspec.reflection.trials import episode_return
+from agentspec.reasoning.common import one_of
+from agentspec.reflection.reflexion import REFLECT, Reflexion
+from agentspec.reflection.trials import TrialLog, episode_return, trial_prompt
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
-from agentspec.types import LLMCall, Task
+from agentspec.types import AgentInput, LLMCall, Recall, Task
 
 PATH = "reflection.retroformer/reflect"
+WHEN = ("end", "start")
+
+
+@dataclass(frozen=True)
+class Due:
+    """A lesson to be written: about which trial, its return, and what the reflector reads (two turns)."""
+
+    trial: int
+    before: float
+    instruction: str
+    request: str
 
 
 @dataclass(frozen=True)
@@ -62,6 +79,8 @@ class Retroformer(Reflexion):
         max_prompt_updates: lessons shown to the actor, the newest ones.
         threshold, max_repeats, key, reflection_tokens, trial_tokens: as in
             :class:`~agentspec.reflection.reflexion.Reflexion`.
+        when: whether a lesson is written at the ``end`` of the failed trial or at the ``start`` of the next one.
+        temperature: sampling temperature of lessons (``None``: the agent's).
     """
 
     name = "retroformer"
@@ -75,14 +94,29 @@ class Retroformer(Reflexion):
         key: str = "task",
         reflection_tokens: int = 128,
         trial_tokens: int = 1024,
+        when: str = "end",
+        temperature: float | None = None,
     ) -> None:
         super().__init__(services, max_prompt_updates, threshold, max_repeats, key, reflection_tokens, trial_tokens)
+        one_of(self.name, when=(when, WHEN))
+        self.when = when
+        self.temperature = temperature
+        self._due: dict[str, Due] = {}
         self._pending: dict[str, Pending] = {}
         self._measured: dict[str, Any] = {}
 
     def begin_episode(self, task: Task) -> None:
         super().begin_episode(task)
         self._measured = {}
+
+    async def lessons(self, input: AgentInput) -> Recall:
+        """As Reflexion's; writes the lesson that is due first."""
+        due = self._due.pop(self._key, None)
+        if due is not None:
+            # Without room for a lesson the trial is played without one.
+            with contextlib.suppress(BudgetExceededError, ContextOverflowError):
+                await self._write(self._logs[self._key], due)
+        return await super().lessons(input)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """Pay the lesson of the trial before, then learn from this one if it failed."""
@@ -97,23 +131,41 @@ class Retroformer(Reflexion):
                 "return_after": total,
                 "reward": total - paid.before,
             }
-        trial = self._logs[self._key].trials if self._key in self._logs else 0
-        call = await self.reflect(trajectory)
-        if call is not None:
-            self.services.llm.executed(call)
-            self._pending[self._key] = Pending(trajectory.episode, trial, call.id, total)
+        await self.reflect(trajectory)
+
+    async def _ask(self, trajectory: Trajectory, log: TrialLog) -> LLMCall | None:
+        count = self.services.llm.count_tokens
+        messages = trial_prompt(trajectory, log, self.max_reflections, REFLECT, self.trial_tokens, count)
+        due = Due(log.trials, episode_return(trajectory), *(m.text for m in messages))
+        if self.when == "start":
+            self._due[self._key] = due
+            return None
+        return await self._write(log, due)
+
+    async def _write(self, log: TrialLog, due: Due) -> LLMCall:
+        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other."""
+        sampling = {} if self.temperature is None else {"temperature": self.temperature}
+        messages = (system(due.instruction), user(due.request))
+        call = await self.services.llm.generate("reflect", messages, max_tokens=self.reflection_tokens, **sampling)
+        self.services.llm.executed(call)
+        self._pending[self._key] = Pending(call.tag.episode, due.trial, call.id, due.before)
+        lesson = " ".join(call.text.split())
+        if lesson:
+            log.lessons = [*log.lessons, (due.trial, lesson)][-self.max_reflections :]
+        return call
 
     def metrics(self) -> dict[str, Any]:
-        """What the lesson of the trial before was worth; empty if there was none."""
-        return dict(self._measured)
+        """What the lesson of the trial before was worth (if there was one), and whether this trial's is ``due``."""
+        return self._measured | ({"due": True} if self._key in self._due else {})
 
     def snapshot(self) -> bytes:
-        pending = {key: asdict(p) for key, p in self._pending.items()}
-        return dump_state([load_state(super().snapshot()), pending, self._measured])
+        waiting = [{key: asdict(entry) for key, entry in table.items()} for table in (self._due, self._pending)]
+        return dump_state([load_state(super().snapshot()), *waiting, self._measured])
 
     def restore(self, blob: bytes) -> None:
-        logs, pending, self._measured = load_state(blob)
+        logs, due, pending, self._measured = load_state(blob)
         super().restore(dump_state(logs))
+        self._due = {key: Due(**d) for key, d in due.items()}
         self._pending = {key: Pending(**p) for key, p in pending.items()}
 
 
@@ -126,10 +178,10 @@ def reflection_samples(trajectories: Iterable[Trajectory]) -> list[ReflectionSam
     written: dict[tuple[str, int], LLMCall] = {}
     samples = []
     for trajectory in trajectories:
+        written |= {(trajectory.episode, c.id): c for c in trajectory.calls if c.tag.path == PATH}
         paid = trajectory.metrics
         call = written.get((str(paid.get("reflection/episode")), int(paid.get("reflection/call", -1))))
         if call is not None:
             group = hashlib.sha256(repr(call.prompt_ids).encode()).hexdigest()[:12]
             samples.append(ReflectionSample(group, call, float(paid["reflection/reward"])))
-        written |= {(trajectory.episode, c.id): c for c in trajectory.calls if c.tag.path == PATH}
     return samples

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("transformers")
 
 from agentspec.llm.base import ContextOverflowError, LLMError, Request, system, user
-from agentspec.llm.vllm import Sampled, VLLMBackend, colocated, server
+from agentspec.llm.vllm import Sampled, VLLMBackend, colocated, server, trl_backend
 from agentspec.types import CallTag, Sampling
 from tests.tiny import tiny_tokenizer
 
@@ -139,7 +139,7 @@ class FakeVLLM:
 def test_colocated(monkeypatch: pytest.MonkeyPatch, reason: str) -> None:
     fake_vllm(monkeypatch)
     llm = FakeVLLM(reason)
-    run = colocated(SimpleNamespace(llm=llm))
+    run = colocated(SimpleNamespace(llm=llm, accelerator=SimpleNamespace(device=SimpleNamespace(type="cpu"))))
     kinds = [Sampling(temperature=0.7, max_tokens=5, stop=("\n",)), Sampling(top_p=0.9, top_k=20, n=2)]
     got = run([(1, 2), (3,)], kinds, [5, 2**31 + 6])
     # Each sampled token has its own log-probability, not that of a likelier one; one list per prompt.
@@ -153,22 +153,50 @@ def test_colocated(monkeypatch: pytest.MonkeyPatch, reason: str) -> None:
     assert all(p.include_stop_str_in_output and p.logprobs == 0 for p in parameters)
 
 
+class Client:
+    """TRL's client: answers the first token of the prompt and its seed, a likelier token beside each."""
+
+    def __init__(self, logprobs_mode: str = "processed_logprobs") -> None:
+        self.asked: list[tuple[Any, dict[str, Any]]] = []
+        self.logprobs_mode = logprobs_mode
+
+    def get_server_info(self) -> Any:
+        return {"model_config": {"logprobs_mode": self.logprobs_mode, "max_model_len": 77}}
+
+    def generate(self, prompts: Any, **fields: Any) -> Any:
+        self.asked.append((prompts, fields))
+        ids = [prompts[0][0], fields["generation_kwargs"]["seed"]]
+        return {
+            "completion_ids": [ids] * fields["n"],
+            "logprobs": [[[-0.1, -0.25], [-0.5]]] * fields["n"],
+            "logprob_token_ids": [[[99, ids[0]], [ids[1]]]] * fields["n"],
+        }
+
+
 def test_server() -> None:
-    asked: list[dict[str, Any]] = []
-
-    class Client:
-        def generate(self, prompts: Any, **fields: Any) -> Any:
-            asked.append({"prompts": prompts, **fields})
-            count = len(prompts) * fields["n"]
-            ids = [[prompts[i // fields["n"]][0], i] for i in range(count)]
-            return {"completion_ids": ids, "logprobs": [[[-0.25], [-0.5]]] * count}
-
-    run = server(SimpleNamespace(vllm_client=Client()))
+    client = Client()
     short, pair = Sampling(max_tokens=2, stop=("\n",)), Sampling(max_tokens=9, n=2)
-    got = run([(1,), (2,), (3,)], [short, pair, short], [0, 1, 2])
-    # One request per kind of sampling; the answers come back in the order of the prompts.
-    assert [a["prompts"] for a in asked] == [[[1], [3]], [[2]]]
-    assert [[s.token_ids for s in samples] for samples in got] == [[(1, 0)], [(2, 0), (2, 1)], [(3, 1)]]
+    got = server(client)([(1,), (2,), (3,)], [short, pair, short], [10, 11, 2**31 + 12])
+    # The answers come back in the order of the prompts, each from its own seed.
+    assert [[s.token_ids for s in samples] for samples in got] == [[(1, 10)], [(2, 11), (2, 11)], [(3, 12)]]
     assert got[0][0].finish_reason == "length" and got[1][0].finish_reason == "stop"
-    assert got[1][0].logprobs == (-0.25, -0.5)
-    assert asked[0]["generation_kwargs"] == {"stop": ["\n"], "include_stop_str_in_output": True}
+    assert got[1][0].logprobs == (-0.25, -0.5)  # the sampled token's, not the likelier one's
+    ((prompts, fields),) = [asked for asked in client.asked if asked[0] == [[1]]]
+    assert prompts == [[1]] and (fields["n"], fields["max_tokens"], fields["logprobs"]) == (1, 2, 0)
+    assert fields["generation_kwargs"] == {"stop": ["\n"], "include_stop_str_in_output": True, "seed": 10}
+
+
+def test_the_backend_of_trl_s_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Client()
+    backend = trl_backend(SimpleNamespace(mode="server", vllm_client=client), tiny_tokenizer())
+    assert backend.max_context == 77  # the server's own limit
+    # Processes other than the main one have no client from TRL.
+    monkeypatch.setattr("trl.generation.vllm_client.VLLMClient", lambda **fields: asked.append(fields) or client)
+    asked: list[dict[str, Any]] = []
+    other = SimpleNamespace(
+        mode="server", server_base_url=None, server_host="host", server_port=8000, server_timeout=3.0
+    )
+    assert trl_backend(other, tiny_tokenizer()).max_context == 77
+    assert asked == [{"base_url": "http://host:8000", "connection_timeout": 3.0}]
+    with pytest.raises(LLMError, match="--logprobs-mode raw_logprobs"):
+        trl_backend(SimpleNamespace(mode="server", vllm_client=Client("raw_logprobs")), tiny_tokenizer())

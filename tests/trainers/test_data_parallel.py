@@ -73,7 +73,7 @@ def built_episode(case: str, job: Job) -> Trajectory:
     return episode(calls, [value], rollout=job.rollout, status=status)
 
 
-def make_trainer(folder: Path, case: str) -> ScaffoldGRPOTrainer:
+def make_trainer(folder: Path, case: str, **changes: Any) -> ScaffoldGRPOTrainer:
     processes = int(os.environ.get("WORLD_SIZE", "1"))
     agent = {"reasoning": "direct", "memory": {"name": "summary", "every": 2, "summary_tokens": 4}}
     settings: dict[str, Any] = {
@@ -94,6 +94,7 @@ def make_trainer(folder: Path, case: str) -> ScaffoldGRPOTrainer:
         "logging_steps": 1,
         "disable_tqdm": True,
         **CASES[case],
+        **changes,
     }
     if case == "carried":
         sampling = {"max_tokens": 8}

@@ -21,7 +21,7 @@ from trainers.audit import audit
 from trainers.batches import Row
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
-from trainers.resume import ScaffoldState, load_state, save_state
+from trainers.resume import ScaffoldState, checkpoints, last_complete_checkpoint, load_state, save_state, set_aside
 from trainers.rollouts import task_rows
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
@@ -133,10 +133,30 @@ def test_a_new_run_in_the_folder_of_an_old_one_starts_new_logs(tmp_path: Path) -
     assert [r["step"] for r in RunLog(tmp_path).read("metrics.jsonl")] == [1]
 
 
+def test_a_new_run_sets_the_checkpoints_of_an_old_one_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed before its first checkpoint, it has none to resume from, and nothing of the old run is lost."""
+    trainer(tmp_path, max_steps=2).train()
+    killed = trainer(tmp_path, max_steps=2)
+    monkeypatch.setattr(killed, "_play", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        killed.train()
+    assert last_complete_checkpoint(tmp_path) is None
+    aside = tmp_path / "earlier" / "1"
+    assert last_complete_checkpoint(aside) == aside / "checkpoint-2"
+    assert str(aside) in capsys.readouterr().err
+    # Resuming with nothing to resume from begins anew; a third run does not mix with the first.
+    again = trainer(tmp_path, max_steps=1)
+    again.train(resume_from_checkpoint=True)
+    assert set_aside(tmp_path) == tmp_path / "earlier" / "2"
+    assert [p.name for p in checkpoints(tmp_path / "earlier" / "2")] == ["checkpoint-1"]
+    assert set_aside(tmp_path) is None
+
+
 def test_a_checkpoint_is_complete_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever interrupts a save, the checkpoint before is still there and is the one to resume from."""
     from trainers import resume as module
-    from trainers.resume import last_complete_checkpoint
 
     run = trainer(tmp_path, save_total_limit=1)
     saved = module.save_state

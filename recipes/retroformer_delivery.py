@@ -1,0 +1,96 @@
+"""Retroformer on DeliveryBench: a reflector trained on what its lessons are worth to a frozen courier.
+
+    python recipes/retroformer_delivery.py --config recipes/configs/retroformer_cpu.yaml
+
+The trained reflector lies in ``output_dir``, the frozen actor in its folder ``actor``. The table at the end says what
+lessons bring on held-out shifts: each is played, reflected on if it was not good enough, and played again, with the
+reflector as it was before training and as it is after.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from recipes.common import draw_curve, parse_config, run_recipe, train
+
+
+def main() -> None:
+    """Train the reflector, draw the curve of gains, evaluate: ``evaluation.md`` and ``evaluation.jsonl``."""
+    from trainers.policy import load_actor_and_reflector
+    from trainers.retroformer import RetroformerTrainer, as_retroformer
+
+    config = as_retroformer(parse_config(default="retroformer_cpu.yaml"))
+    trainer = train(config, trainer_class=RetroformerTrainer, load=load_actor_and_reflector)
+    trainer.accelerator.wait_for_everyone()
+    if not trainer.accelerator.is_main_process:
+        return
+    draw_curve(config, trainer)
+    evaluate_run(config, Path(config.output_dir))
+
+
+def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
+    """Two trials of every held-out task with either reflector: rows, also in ``folder`` with their table."""
+    from agentspec.episode import Job, Runner
+    from agentspec.state import write_atomic
+    from trainers.policy import load_actor_and_reflector
+    from trainers.retroformer import has_lesson, play_trials, routed_llm
+    from trainers.rollouts import make_tasks
+
+    name, options = config.world
+    jobs = [Job(task, 0, config.seed) for task in make_tasks(name, options, config.eval_tasks, split="test")]
+    spec = replace(config.spec, sampling=replace(config.spec.sampling, **config.evaluation_sampling))
+    rows = []
+    for label, run in (("before training", ""), ("after training", folder)):
+        model, tokenizer = load_actor_and_reflector(config, run)
+        runner = Runner(spec, routed_llm(model, tokenizer), timeout_s=config.env_timeout_s, policy=label)
+        firsts, lasts = play_trials(runner.run, jobs)
+        for first, last in zip(firsts, lasts, strict=True):
+            returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]
+            lesson = [c.text for c in last.calls if c.tag.purpose == "reflect"] if has_lesson(last) else []
+            row = {"reflector": label, "task": first.task.key, "seed": first.task.seed, "lesson": "".join(lesson)}
+            rows.append(row | dict(zip(("first_return", "second_return"), returns, strict=True)))
+    write_atomic(folder / "evaluation.jsonl", "".join(json.dumps(row, sort_keys=True) + "\n" for row in rows))
+    table = markdown(rows)
+    write_atomic(folder / "evaluation.md", table)
+    print(table)
+    return rows
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Per reflector the mean return of both trials and what the lessons changed; then after less before.
+
+    A first trial that was good enough has no second one: it counts with its own return, and a gain of 0. Tasks with a
+    trial that failed to run are left out.
+    """
+    from eval.statistics import bootstrap, paired_difference
+    from eval.tables import show, table
+
+    body, gains = [], {}
+    for label in dict.fromkeys(row["reflector"] for row in rows):
+        members = [r for r in rows if r["reflector"] == label]
+        played = [r for r in members if r["first_return"] is not None and r["second_return"] is not None]
+        gains[label] = {r["task"]: r["second_return"] - r["first_return"] for r in played}
+        returns = [bootstrap([r[key] for r in played]) for key in ("first_return", "second_return")]
+        lessons = sum(bool(r["lesson"]) for r in played)
+        numbers = [show(e, 2) for e in (*returns, bootstrap(list(gains[label].values())))]
+        body.append([label, str(len(played)), str(lessons), *numbers])
+    first, *others = gains
+    difference = [show(paired_difference(gains[label], gains[first]), 2) for label in others]
+    lines = [
+        "# What lessons are worth",
+        "",
+        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% bootstrap interval.",
+        "",
+        *table(["reflector", "tasks", "lessons", "first trial", "second trial", "gain"], body),
+        "",
+        *(f"Paired difference in gain, {a} less {first}: {d}." for a, d in zip(others, difference, strict=True)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    run_recipe(main)

@@ -1,0 +1,100 @@
+"""Several processes: which parallel layouts work, and what ranks refuse together.
+
+DDP and DeepSpeed ZeRO 1 and 2 keep whole weights on every rank, so a rank may read them, and run as many forwards as
+its rows need, without asking the others. FSDP and ZeRO-3 shard them: every forward gathers weights from all ranks, so
+nobody may read them between forwards, and all ranks must run the same number of forwards. What breaks that would not
+fail but wait for ever, and is refused at start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from trl.distributed import DistributedBackend
+
+from agentspec.registry import SpecError
+from agentspec.trajectory import Trajectory
+from trainers.config import ScaffoldConfig
+from trainers.runlog import paths_called
+from trainers.sequences import build_sequences
+
+if TYPE_CHECKING:
+    from trl import GRPOTrainer as Base
+else:
+    Base = object
+
+
+def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:
+    """Refuse a parallel layout that this configuration would hang in.
+
+    Raises:
+        SpecError: what cannot work under sharded weights, why, and what to set.
+    """
+    layout = DistributedBackend(accelerator)
+    if not layout.is_fsdp and not layout.is_zero3:
+        return
+    if layout.is_fsdp and layout.fsdp_version != 2:
+        raise SpecError(
+            f"FSDP version {layout.fsdp_version}: only version 2 is known to give the gradients of one process; set "
+            "fsdp_version: 2 (recipes/accelerate/fsdp.yaml)"
+        )
+    name = "FSDP" if layout.is_fsdp else "DeepSpeed ZeRO-3"
+    if not config.use_vllm:
+        raise SpecError(
+            f"{name} keeps a part of the weights on each process, and the local backend samples from whole ones: set "
+            "use_vllm: true, or launch with DDP (recipes/accelerate/ddp.yaml), which LoRA rarely outgrows"
+        )
+    if config.packing != "tree" or config.tokens_per_forward:
+        raise SpecError(
+            f"packing {config.packing!r} with tokens_per_forward {config.tokens_per_forward} under {name}: the number "
+            "of forwards would differ between processes, and they would wait for each other for ever; set packing: "
+            "tree and tokens_per_forward: 0 (a smaller per_device_train_batch_size bounds memory)"
+        )
+
+
+def keep_precision(accelerator: Any) -> None:
+    """Let FSDP compute in its low precision, but not round what goes into a forward and comes out of it.
+
+    accelerate asks for both; temperatures and log-probabilities would have three digits.
+    """
+    plugin = getattr(accelerator.state, "fsdp_plugin", None)
+    policy = getattr(plugin, "mixed_precision_policy", None)
+    if plugin is not None and policy is not None:
+        plugin.mixed_precision_policy = replace(policy, output_dtype=None, cast_forward_inputs=False)
+
+
+class KnownLayout(Base):
+    """Checks the parallel layout before a trainer builds anything on it; mixed into the trainer."""
+
+    def create_accelerator_and_postprocess(self) -> None:
+        super().create_accelerator_and_postprocess()
+        check_layout(self.accelerator, self.args)
+        keep_precision(self.accelerator)
+
+
+def check_trained(
+    episodes: Sequence[Trajectory], config: ScaffoldConfig, gather: Callable[[list[Any]], list[Any]]
+) -> None:
+    """Refuse a generation batch of which no call is trained: of all ranks together, and on all of them.
+
+    A rank that raised alone would leave the others waiting for it.
+
+    Args:
+        episodes: this rank's.
+        config: names the calls that are trained.
+        gather: list of this rank -> concatenated lists of all ranks.
+
+    Raises:
+        SpecError: there are episodes to learn from, and none made such a call.
+    """
+    scored = [t for t in episodes if t.scorable]
+    trained = any(build_sequences(t, config.train_filter) for t in scored)
+    ranks = gather([(bool(scored), trained, paths_called(episodes))])
+    if any(t for _, t, _ in ranks) or not any(s for s, _, _ in ranks):
+        return
+    raise SpecError(
+        f"no call of this generation batch matched train_calls {config.train_calls} with credits "
+        f"{config.train_credits}; the scaffold called {sorted(set().union(*(called for _, _, called in ranks)))}"
+    )

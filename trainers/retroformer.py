@@ -1,0 +1,204 @@
+"""Retroformer (Yao et al., 2024): training the reflector on the change of return that its lessons bring.
+
+Two LoRA adapters sit on one base. The *actor* is frozen and plays; the *reflector* reads a failed trial and writes the
+lesson for the next, and it alone is trained. Calls find their adapter by their tag. A group of GRPO is one failed trial
+of a task, k lessons about it, and k further trials, each played with one of them:
+
+1. each task of the round is played once, from an empty memory;
+2. if that trial failed, k episodes start from the memory it left. Each begins by writing its own lesson
+   (``when: start``) and is paid ``G(this trial) - G(failed trial)`` (reward ``reflection_gain``);
+3. if it did not fail, there is nothing to learn: the trial stands in for the k episodes, without rows or gradient.
+
+The actor is greedy (``actor_temperature: 0``), so that what changes between trials is owed to the lesson; a lesson is
+sampled at the agent's temperature. Everything else is :class:`~trainers.grpo.ScaffoldGRPOTrainer`. The paper trains its
+reflector with a reward model and PPO on stored lessons; here the group is the baseline, and lessons are always fresh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from torch import nn
+
+from agentspec.episode import Job
+from agentspec.llm.base import LLM
+from agentspec.llm.recorder import derive_seed
+from agentspec.reflection.retroformer import PATH
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec, ModuleSpec
+from agentspec.trajectory import Trajectory, write_trajectories
+from trainers.batches import Row
+from trainers.config import ScaffoldConfig
+from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.policy import ACTOR, TRAINED
+from trainers.rollouts import collect
+from trainers.sequences import TrainFilter
+
+REFLECTION, REWARD = "retroformer", "reflection_gain"
+FIRST_TRIALS = "first_trials"
+"""Folder of a run that holds the trials that were reflected on, one file per generation round."""
+
+
+def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
+    """Make ``config`` train the reflector, and nothing else.
+
+    The agent's reflection becomes ``retroformer`` with ``when: start`` and its scope ``run``; the lessons are the
+    trained calls; the reward, unless one is given, is the change of return.
+
+    Raises:
+        SpecError: what is configured says otherwise.
+    """
+    spec = config.spec
+    if spec.reflection.name in ("none", REFLECTION):
+        reflection = ModuleSpec(REFLECTION, {"when": "start", **spec.reflection.params})
+        config.agent = replace(spec, scope="run", reflection=reflection).to_data()
+    if tuple(config.train_calls) == TrainFilter().patterns:
+        config.train_calls = [PATH]
+    config.rewards = config.rewards or {REWARD: 1.0}
+    check_retroformer(config)
+    return config
+
+
+def check_retroformer(config: ScaffoldConfig) -> None:
+    """Refuse what does not train a reflector beside a frozen actor.
+
+    Raises:
+        SpecError: what was given, and what to set.
+    """
+    spec = config.spec
+    if spec.reflection.name != REFLECTION:
+        raise SpecError(
+            f"the reflector is trained in `reflection: {REFLECTION}`; the agent has {spec.reflection.name!r}"
+        )
+    if spec.reflection.params.get("when") != "start" or spec.scope != "run":
+        raise SpecError(
+            "a lesson and the trial that pays it must be one episode that starts from the failed trial's memory: set "
+            f"`reflection: {{name: {REFLECTION}, when: start}}` and `scope: run`"
+        )
+    if spec.reflection.params.get("temperature") == 0:
+        raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
+    if config.train_calls != [PATH]:
+        raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
+    if REWARD not in config.reward_set.weights:
+        raise SpecError(f"rewards {config.rewards}: a lesson is paid the change of return; give {REWARD!r} a weight")
+    if config.lora_r == 0:
+        raise SpecError("lora_r is 0: all weights would be trained, the actor's among them; give the reflector a rank")
+    if config.use_vllm:
+        raise SpecError(
+            "use_vllm: the engine holds one set of weights, with the trained adapter merged in; actor and reflector "
+            "differ. Use the local backend (use_vllm: false)"
+        )
+    if config.per_device_train_batch_size * config.steps_per_generation % config.num_generations:
+        raise SpecError(
+            f"{config.per_device_train_batch_size} x {config.steps_per_generation} rollouts per process are no whole "
+            f"groups of {config.num_generations}: lessons about one failed trial are written where it was played"
+        )
+
+
+class RetroformerTrainer(ScaffoldGRPOTrainer):
+    """GRPO for the reflector of a frozen actor.
+
+    Args:
+        model: a PEFT model as of :func:`~trainers.policy.load_actor_and_reflector`.
+        args: as of :func:`as_retroformer`.
+        make_llm: model, tokenizer -> a backend that gives each call its adapter.
+        kwargs: as of :class:`~trainers.grpo.ScaffoldGRPOTrainer`.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        args: ScaffoldConfig,
+        *,
+        make_llm: Callable[[nn.Module, Any], LLM] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        check_retroformer(args)
+        super().__init__(model, args, make_llm=make_llm or routed_llm, **kwargs)
+        self._first_trials: list[Trajectory] = []
+
+    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
+        runner = self._runner(spec or acting_scaffold(self.args))
+        self._first_trials, episodes = play_trials(
+            lambda trials: collect(runner, trials, retries=self.args.retries, rewards=self.rewards_used), jobs
+        )
+        return episodes
+
+    def _carried_memory(self) -> bytes | None:
+        """None: every round's first trials are first trials."""
+        return None
+
+    def _rows(self) -> list[Row]:
+        try:
+            return super()._rows()
+        except SpecError:
+            if any(map(has_lesson, self._episodes)):
+                raise
+            return []  # no first trial failed: there is nothing to learn from this round
+
+    def _log_episodes(self) -> None:
+        """As for any run; also what the lessons were worth, and the trials they are about."""
+        super()._log_episodes()
+        scored = [t for t in self._first_trials if t.scorable]
+        gains = [float(t.metrics["reflection/reward"]) for t in self._episodes if t.scorable and has_lesson(t)]
+        for name, values in (
+            ("failed_first_trials", [float(is_due(t)) for t in scored]),
+            ("first_return", [float(t.metrics["return"]) for t in scored]),
+            ("gain", gains),
+        ):
+            if values:
+                self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
+        name = f"{self._round:06d}.rank{self.accelerator.process_index}.jsonl"
+        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, self._first_trials)
+
+
+def play_trials(
+    play: Callable[[Sequence[Job]], list[Trajectory]], jobs: Sequence[Job]
+) -> tuple[list[Trajectory], list[Trajectory]]:
+    """The first trial of each group of jobs, and for every job the trial that follows it.
+
+    Args:
+        play: jobs -> episodes, in order.
+        jobs: groups one after the other; a group begins with rollout 0.
+
+    Returns:
+        first trials, one per group, and episodes, one per job; where the first trial left no lesson to be written, it
+        takes the episode's place (under the job's rollout number).
+    """
+    heads = [replace(j, run_seed=derive_seed(j.run_seed, "first trial")) for j in jobs if j.rollout == 0]
+    firsts = play(heads)
+    groups = [i for i, j in enumerate(jobs) if j.rollout == 0]
+    before = [firsts[sum(start <= i for start in groups) - 1] for i in range(len(jobs))]
+    due = [i for i, first in enumerate(before) if is_due(first)]
+    episodes = [replace(first, rollout=job.rollout) for first, job in zip(before, jobs, strict=True)]
+    followed = play([replace(jobs[i], memory_state=before[i].memory_state) for i in due])
+    for i, trajectory in zip(due, followed, strict=True):
+        episodes[i] = trajectory
+    return firsts, episodes
+
+
+def is_due(trajectory: Trajectory) -> bool:
+    """Whether the trial failed and waits to be reflected on."""
+    return trajectory.scorable and bool(trajectory.metrics.get("reflection/due"))
+
+
+def has_lesson(trajectory: Trajectory) -> bool:
+    """Whether the episode began with a lesson, which it now pays."""
+    return "reflection/reward" in trajectory.metrics
+
+
+def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
+    """The scaffold with the actor at ``actor_temperature`` and lessons at the agent's own temperature."""
+    spec = config.spec
+    params = {"temperature": spec.sampling.temperature, **spec.reflection.params}
+    sampling = replace(spec.sampling, temperature=config.actor_temperature)
+    return replace(spec, reflection=ModuleSpec(spec.reflection.name, params), sampling=sampling)
+
+
+def routed_llm(model: nn.Module, tokenizer: Any) -> LLM:
+    """The local backend: lessons come from the trained adapter, everything else from the actor's."""
+    from agentspec.llm.local import LocalLLM
+
+    return LocalLLM(model, tokenizer, name="policy", adapters={PATH: TRAINED, "*": ACTOR})
