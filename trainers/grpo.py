@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -75,7 +76,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         self._packing: dict[str, Any] = {"packing": args.packing, "tokens_per_forward": args.tokens_per_forward}
         self.run_log = RunLog(args.output_dir)
         self._make_env = make_env
-        self._make_llm = make_llm or local_llm
+        self._make_llm = make_llm or partial(local_llm, batching=args.batching)
         self._llm: LLM | None = None
         self._round = 0
         self._memory: bytes | None = None
@@ -388,8 +389,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         return metrics
 
 
-def local_llm(model: nn.Module, tokenizer: Any) -> LLM:
+def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "ordered") -> LLM:
     """The local backend over the live policy."""
     from agentspec.llm.local import LocalLLM
 
-    return LocalLLM(model, tokenizer, name="policy")
+    return LocalLLM(model, tokenizer, name="policy", batching=batching)

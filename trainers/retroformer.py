@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from torch import nn
@@ -116,7 +117,7 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         **kwargs: Any,
     ) -> None:
         check_retroformer(args)
-        super().__init__(model, args, make_llm=make_llm or routed_llm, **kwargs)
+        super().__init__(model, args, make_llm=make_llm or partial(routed_llm, batching=args.batching), **kwargs)
         self._first_trials: list[Trajectory] = []
 
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
@@ -197,8 +198,8 @@ def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
     return replace(spec, reflection=ModuleSpec(spec.reflection.name, params), sampling=sampling)
 
 
-def routed_llm(model: nn.Module, tokenizer: Any) -> LLM:
+def routed_llm(model: nn.Module, tokenizer: Any, batching: Any = "ordered") -> LLM:
     """The local backend: lessons come from the trained adapter, everything else from the actor's."""
     from agentspec.llm.local import LocalLLM
 
-    return LocalLLM(model, tokenizer, name="policy", adapters={PATH: TRAINED, "*": ACTOR})
+    return LocalLLM(model, tokenizer, name="policy", adapters={PATH: TRAINED, "*": ACTOR}, batching=batching)
