@@ -10,15 +10,17 @@ model it optimises; its weights may change between batches (the caches notice in
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from os import PathLike
 from typing import Any
 
 from agentspec.llm.base import LLMError, Message, Request, require_context
-from agentspec.llm.batching import Batcher
+from agentspec.llm.batching import Batcher, Batching
 from agentspec.llm.chat import ChatFormat
 from agentspec.llm.constrain import ChoiceTrie
+from agentspec.llm.local_adapters import UNTAGGED, adapter_for, check_adapters
 from agentspec.llm.local_engine import Engine
 from agentspec.llm.local_forward import PackedModel
 from agentspec.llm.local_rows import Job
@@ -39,9 +41,18 @@ class LocalLLM:
         max_context: context window; by default the model's.
         template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
         patience_s: see :class:`~agentspec.llm.batching.Batcher`.
+        batching: see :data:`~agentspec.llm.batching.Batching`. By default batches are continuous and runs repeatable.
+            Where answers are long and environments take several times as long as a forward of the model, ``"eager"``
+            is faster, or, if runs must be repeatable, ``"closed"``.
+        adapters: which adapter of a PEFT model answers which calls: shell pattern over the call's tag path -> name,
+            first match wins (see :mod:`~agentspec.llm.local_adapters`), e.g.
+            ``{"reflection.retroformer/*": "reflector", "*": "actor"}``. What matches nothing is answered by the
+            adapter that is active.
 
     Raises:
-        LLMError: the architecture cannot run in this backend (checked again, numerically, before the first batch).
+        ValueError: an unknown ``batching``.
+        LLMError: the model does not have an adapter named, or its architecture cannot run in this backend (checked
+            again, numerically, before the first batch).
     """
 
     capabilities = frozenset({"token_ids", "logprobs", "choices", "score", "n"})
@@ -57,10 +68,14 @@ class LocalLLM:
         max_context: int | None = None,
         template_kwargs: Mapping[str, Any] | None = None,
         patience_s: float = 60.0,
+        adapters: Mapping[str, str] | None = None,
+        batching: Batching = "ordered",
     ) -> None:
         self.name = name
         self.model = model
         self.tokenizer = tokenizer
+        self.adapters = dict(adapters or {})
+        check_adapters(model, self.adapters)
         self.chat = ChatFormat(tokenizer, template_kwargs)
         packed = PackedModel(model)
         self.max_context = max_context or packed.max_context
@@ -72,7 +87,8 @@ class LocalLLM:
             max_batch=max_batch,
             max_cache_tokens=max_cache_tokens,
         )
-        self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s)
+        self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s, batching=batching)
+        self._left: deque[str] = deque()
         self._trie = lru_cache(maxsize=512)(self._make_trie)
 
     @classmethod
@@ -129,7 +145,8 @@ class LocalLLM:
         prompt = self.chat.render(request.messages)
         trie = self._trie(sampling.choices) if sampling.choices else None
         require_context(len(prompt), trie.longest if trie else sampling.max_tokens, self.max_context)
-        job = Job(request.tag.episode, prompt, sampling, request.seed, trie)
+        adapter = adapter_for(request.tag.path, self.adapters)
+        job = Job(request.tag.episode, prompt, sampling, request.seed, trie, adapter=adapter)
         await self._submit(request.id, job)
         usage = Usage(len(prompt), sum(len(c.token_ids) for c in job.completions), job.cached)
         latency = time.perf_counter() - began
@@ -138,13 +155,16 @@ class LocalLLM:
     async def score(
         self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
     ) -> tuple[float, ...]:
-        """Log-probability of each continuation after the prompt; what they share is computed once."""
+        """Log-probability of each continuation after the prompt; what they share is computed once.
+
+        A scoring carries no tag: of ``adapters``, only a pattern that matches everything routes it.
+        """
         if not continuations:
             return ()
         prompt = self.chat.render(messages)
         encoded = tuple(self.chat.encode(c) for c in continuations)
         require_context(len(prompt), max(map(len, encoded)), self.max_context)
-        job = Job(episode, prompt, Sampling(), continuations=encoded)
+        job = Job(episode, prompt, Sampling(), continuations=encoded, adapter=adapter_for(UNTAGGED, self.adapters))
         await self._submit(-1, job)
         return job.scores
 
@@ -158,8 +178,8 @@ class LocalLLM:
 
     def leave(self, episode: str) -> None:
         """A live episode ended: the others no longer wait for it."""
+        self._left.append(episode)
         self._batcher.leave(episode)
-        self._engine.cache.release(episode)
 
     def invalidate(self) -> None:
         """Drop all cached keys and values: the weights, or the adapter in use, changed."""
@@ -172,21 +192,50 @@ class LocalLLM:
 
     def _run(self, jobs: Sequence[Job]) -> None:
         """Run a batch in the worker thread. If it fails, each job runs alone, so that only the one at fault fails."""
+        self._release()
+        left = {id(job): job for job in jobs}
+
+        def exchange(done: Sequence[Job], rest: int) -> Sequence[Job]:
+            for job in done:
+                del left[id(job)]
+            joining = self._batcher.exchange(done, rest)
+            if joining:
+                self._release()
+            left.update((id(job), job) for job in joining)
+            return joining
+
         try:
-            self._engine.run(jobs)
+            self._engine.run(jobs, exchange)
         except LLMError:
             raise
         except Exception as error:  # whatever a model raises
             self._engine.cache.clear()
-            if len(jobs) > 1:
-                for job in jobs:
-                    job.completions, job.scores = (), ()
-                    self._run([job])
+            if len(left) == 1:
+                (job,) = left.values()
+                job.error = self._failure(job, error)
                 return
-            jobs[0].error = LLMError(
-                f"the model {self.name} failed on a prompt of {len(jobs[0].prompt)} tokens: {type(error).__name__}: "
-                f"{error}; if it ran out of memory, lower `max_batch`, `max_cache_tokens` or the length of prompts"
-            )
+            for job in left.values():
+                self._run_alone(job)
+
+    def _release(self) -> None:
+        """Free what ended episodes have cached when others join, not when they happen to end: that hangs on timing."""
+        while self._left:
+            self._engine.cache.release(self._left.popleft())
+
+    def _run_alone(self, job: Job) -> None:
+        try:
+            self._engine.run([job])
+        except LLMError:
+            raise
+        except Exception as error:
+            self._engine.cache.clear()
+            job.error = self._failure(job, error)
+
+    def _failure(self, job: Job, error: Exception) -> LLMError:
+        return LLMError(
+            f"the model {self.name} failed on a prompt of {len(job.prompt)} tokens: {type(error).__name__}: "
+            f"{error}; if it ran out of memory, lower `max_batch`, `max_cache_tokens` or the length of prompts"
+        )
 
     def _decode(self, ids: Sequence[int]) -> str:
         return str(self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False))

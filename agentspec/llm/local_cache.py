@@ -8,7 +8,8 @@ them:
 - any other slot (the same static prompt in another episode, another module's view of this episode) is *copied* up to
   the common prefix. Copying a token costs about a hundredth of computing it.
 
-The least recently used slots go first when the bound on tokens is passed.
+The least recently used slots go first when the bound on tokens is passed. Adapters share the bound, and nothing else:
+keys and values that one adapter computed are never found by another.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Slot:
     layer first writes; only the first ``length`` positions are meaningful.
     """
 
-    __slots__ = ("capacity", "epoch", "keys", "length", "owner", "tokens", "used", "values")
+    __slots__ = ("adapter", "capacity", "epoch", "keys", "length", "owner", "tokens", "used", "values")
 
     def __init__(self, layers: int, capacity: int) -> None:
         self.keys: list[torch.Tensor | None] = [None] * layers
@@ -41,6 +42,7 @@ class Slot:
         self.length = 0
         self.tokens = np.empty(0, np.int32)
         self.owner: str | None = None
+        self.adapter = ""
         self.epoch = 0
         self.used = 0
 
@@ -129,11 +131,15 @@ class PrefixCache:
                 if slot.owner == owner:
                     slot.owner = None
 
-    def assign(self, prompts: Sequence[tuple[Sequence[int], int, str, int]]) -> list[Slot]:
+    def assign(
+        self, prompts: Sequence[tuple[Sequence[int], int, str, int]], adapter: str = "", live: int = 0
+    ) -> list[Slot]:
         """One slot per row, with the longest known prefix in place.
 
         Args:
             prompts: per row the tokens, the longest prefix that may be reused, the episode, and the capacity needed.
+            adapter: the adapter that computes them.
+            live: positions that running calls hold.
 
         Returns:
             Slots, no longer in the cache, in the order of the rows.
@@ -142,7 +148,7 @@ class PrefixCache:
             self._clock += 1
             arrays = [np.asarray(tokens[:limit], np.int32) for tokens, limit, _, _ in prompts]
             # All are matched before any slot is taken, and all copies are made before any slot is written.
-            matches = [self._match(a, owner) for a, (_, _, owner, _) in zip(arrays, prompts, strict=True)]
+            matches = [self._match(a, owner, adapter) for a, (_, _, owner, _) in zip(arrays, prompts, strict=True)]
             taken: dict[int, Slot] = {}
             for i, (match, (_, _, owner, _)) in enumerate(zip(matches, prompts, strict=True)):
                 slot = match.slot
@@ -159,8 +165,8 @@ class PrefixCache:
                 slot.length = matches[i].length
             for slot, (_, _, owner, capacity) in zip(found, prompts, strict=True):
                 slot.reserve(capacity)
-                slot.owner, slot.epoch = owner, self._epoch
-            self._trim(sum(s.capacity for s in found))
+                slot.owner, slot.adapter, slot.epoch = owner, adapter, self._epoch
+            self._trim(live + sum(s.capacity for s in found))
             return found
 
     def put(self, slot: Slot, tokens: Sequence[int]) -> None:
@@ -175,9 +181,11 @@ class PrefixCache:
             self._slots.append(slot)
             self._trim(0)
 
-    def _match(self, prompt: np.ndarray, owner: str) -> Match:
+    def _match(self, prompt: np.ndarray, owner: str, adapter: str) -> Match:
         best, rank = Match(), (0, 0)
         for slot in self._slots:
+            if slot.adapter != adapter:
+                continue
             length = common_prefix(slot.tokens, prompt)
             # A slot that may be continued is worth a few tokens: it saves a copy and the memory of another slot.
             bonus = _BONUS if self._may_continue(slot, length, owner) else 0

@@ -6,7 +6,8 @@ not computed (the rollouts of one task, the samples of one request, the static t
 takes the rows that are writing first and fills up with tokens still to be read: on a CPU a forward of 16 single
 tokens costs nearly as much as one of 64, so writing beside another row's reading is almost free.
 
-:meth:`Engine.run` works off one closed set of jobs. Continuous batching would admit rows between two turns of its loop.
+Between two forwards the jobs that are done can be exchanged for others, whose rows then join those that run
+(continuous batching): :meth:`Engine.run` does not know when that is wise (:mod:`agentspec.llm.batching` does).
 """
 
 from __future__ import annotations
@@ -16,10 +17,15 @@ from itertools import pairwise
 
 import torch
 
+from agentspec.llm.local_adapters import active_adapter, using
 from agentspec.llm.local_cache import PrefixCache
 from agentspec.llm.local_forward import PackedModel, Segment
-from agentspec.llm.local_rows import ChoiceRow, FreeRow, Job, Row, SampleRow, ScoreRow, choose, sample
+from agentspec.llm.local_lineup import Lineup
+from agentspec.llm.local_rows import ChoiceRow, FreeRow, Job, Row, ScoreRow, choose, sample
 from agentspec.tokens import shared_prefix
+
+Exchange = Callable[[Sequence[Job], int], Sequence[Job]]
+"""Jobs that are done, and how many tokens the others still write at most -> jobs that join."""
 
 _TOKENS_PER_FORWARD = {"cpu": 512}
 _DEFAULT_TOKENS = 8192
@@ -50,36 +56,49 @@ class Engine:
         self._stop_ids = stop_ids
         self._decode = decode
         self._max_batch = max_batch
-        self._weights: tuple[int, int, str] | None = None
+        self._weights: tuple[int, int] | None = None
 
-    def run(self, jobs: Sequence[Job]) -> None:
-        """Fill in ``completions`` or ``scores``, and ``cached``, of every job."""
+    def run(self, jobs: Sequence[Job], exchange: Exchange = lambda done, rest: ()) -> None:
+        """Fill in ``completions`` or ``scores``, and ``cached``, of every job.
+
+        Args:
+            jobs: what to begin with.
+            exchange: called between two forwards with the jobs that are done (often none) and the most tokens that a
+                row still writes; returns the jobs that join.
+        """
         self.model.check()
         self._forget_old_weights()
-        rows = [row for job in jobs for row in job.rows(self._stop_ids, self._decode)]
-        todo = sorted((r for r in rows if not r.done), key=lambda r: r.tokens)
+        lineup = Lineup(self._max_batch, active_adapter(self.model.model), self._stop_ids, self._decode)
+        lineup.add(jobs)
         with self.model.session():
-            for start in range(0, len(todo), self._max_batch):
-                self._run_group(todo[start : start + self._max_batch])
-        self._collect(rows)
+            while lineup.jobs:
+                self._run_group(lineup, exchange)
+                # Some needed no forward.
+                lineup.add(exchange(lineup.collect(), lineup.rest))
 
-    def _run_group(self, rows: list[Row]) -> None:
-        self._place(rows)
+    def _run_group(self, lineup: Lineup, exchange: Exchange) -> None:
+        """Forwards with one adapter, as long as it has its turn."""
+        adapter = lineup.adapter
         budget = _TOKENS_PER_FORWARD.get(self.model.device.type, _DEFAULT_TOKENS)
-        active = rows
-        while active:
-            step = _schedule(active, budget)
-            self._advance(step)
-            for row, _ in step:
-                if row.done:
-                    self._finish(row)
-            active = [r for r in active if not r.done]
+        with using(self.model.model, adapter):
+            while lineup.rows and lineup.adapter == adapter:
+                running = list(lineup.running)
+                self._place(lineup.admit(), running)
+                self._advance(_schedule(lineup.running, budget))
+                for row in lineup.running:
+                    if row.done:
+                        self._finish(row, lineup.running)
+                lineup.add(exchange(lineup.collect(), lineup.rest))
 
-    def _place(self, rows: list[Row]) -> None:
-        """Give each row a slot with what is cached, and the row before it as the source of what they share."""
+    def _place(self, rows: Sequence[Row], running: Sequence[Row]) -> None:
+        """Give each row a slot with what is known of it, and the row before it as the source of what they share."""
+        if not rows:
+            return
         prompts = [(r.tokens, r.wanted, r.job.episode, r.room) for r in rows]
-        for row, slot in zip(rows, self.cache.assign(prompts), strict=True):
+        live = sum(r.slot.capacity for r in running)
+        for row, slot in zip(rows, self.cache.assign(prompts, rows[0].job.adapter, live), strict=True):
             row.slot = slot
+            _copy_longest(row, running)
             row.computed = row.known = slot.length
         for before, row in pairwise(rows):
             shared = min(shared_prefix(before.tokens, row.tokens), row.wanted)
@@ -117,28 +136,39 @@ class Engine:
         if writing:
             sample([r for r, _ in writing], torch.cat([x for _, x in writing]))
 
-    def _finish(self, row: Row) -> None:
+    def _finish(self, row: Row, running: Sequence[Row]) -> None:
         """Keep the first sample's keys and values; the others' differ in a few tokens only."""
-        if row.index == 0:
-            length = len(row.job.prompt) if isinstance(row, ScoreRow) else row.slot.length
-            self.cache.put(row.slot, row.tokens[: min(length, row.slot.length)])
-
-    def _collect(self, rows: Sequence[Row]) -> None:
-        for row in rows:
-            if isinstance(row, ScoreRow):
-                row.job.scores += (row.total,)
-            elif isinstance(row, SampleRow):
-                row.job.completions += (row.completion(),)
+        if row.index:
+            return
+        for other in running:
+            if other.source is row:
+                # From now on the slot may be continued by a row that joins.
+                other.slot.copy_prefix(row.slot, other.computed)
+                other.source, other.known = None, other.computed
+        length = len(row.job.prompt) if isinstance(row, ScoreRow) else row.slot.length
+        self.cache.put(row.slot, row.tokens[: min(length, row.slot.length)])
 
     def _forget_old_weights(self) -> None:
-        """Drop the cache when the weights were written to, or another adapter chosen, since the last call."""
-        model = self.model.model
-        parameters = [p for p in model.parameters() if not p.is_inference()]
-        adapter = str(getattr(model, "active_adapter", ""))
-        weights = (sum(p._version for p in parameters), sum(p.data_ptr() for p in parameters), adapter)
+        """Drop the cache when the weights of the model or of any adapter were written to since the last call."""
+        parameters = [p for p in self.model.model.parameters() if not p.is_inference()]
+        weights = (sum(p._version for p in parameters), sum(p.data_ptr() for p in parameters))
         if self._weights not in (None, weights):
             self.cache.clear()
         self._weights = weights
+
+
+def _copy_longest(row: Row, running: Sequence[Row]) -> None:
+    """Copy what a running row has computed of the tokens of ``row``, where that is more than its slot holds."""
+    best, length = None, row.slot.length
+    for other in running:
+        stop = min(other.slot.length, row.wanted)
+        # Comparing the next token first spares nearly all comparisons of whole prefixes.
+        if length < stop and other.tokens[length] == row.tokens[length]:
+            shared = shared_prefix(other.tokens[:stop], row.tokens[:stop])
+            if shared > length:
+                best, length = other, shared
+    if best is not None:
+        row.slot.copy_prefix(best.slot, length)
 
 
 def _schedule(active: Sequence[Row], budget: int) -> list[tuple[Row, int]]:

@@ -23,7 +23,10 @@ from agentspec.types import Completion, Sampling
 
 @dataclass
 class Job:
-    """A request as the engine sees it: prompt ids, how to sample, or the continuations to score."""
+    """A request as the engine sees it: prompt ids, how to sample, or the continuations to score.
+
+    ``adapter`` names the adapter that answers; the active one if empty.
+    """
 
     episode: str
     prompt: list[int]
@@ -31,6 +34,7 @@ class Job:
     seed: int = 0
     trie: ChoiceTrie | None = None
     continuations: tuple[tuple[int, ...], ...] = ()
+    adapter: str = ""
     completions: tuple[Completion, ...] = ()
     scores: tuple[float, ...] = ()
     cached: int = 0
@@ -68,6 +72,11 @@ class Row:
     def room(self) -> int:
         """Positions the row may need in the end."""
         return len(self.tokens) + 1
+
+    @property
+    def rest(self) -> int:
+        """Most tokens that are still to be written."""
+        return 0
 
     def uniform(self) -> float:
         """The row's next number in [0, 1)."""
@@ -135,6 +144,11 @@ class ChoiceRow(SampleRow):
         return len(self.job.prompt) + self._trie.longest
 
     @property
+    def rest(self) -> int:
+        """What the longest choice has left."""
+        return self._trie.longest - len(self.logprobs)
+
+    @property
     def allowed(self) -> tuple[int, ...]:
         """Ids to choose from now."""
         return self._trie.allowed(self._node)
@@ -174,6 +188,11 @@ class FreeRow(SampleRow):
     def room(self) -> int:
         """The prompt and some of the answer; the slot grows when an answer is long."""
         return len(self.tokens) + min(self.job.sampling.max_tokens, 64)
+
+    @property
+    def rest(self) -> int:
+        """What ``max_tokens`` leaves."""
+        return self.job.sampling.max_tokens - len(self.logprobs)
 
     def take(self, token: int, logprob: float) -> None:
         """Append a sampled token and see whether it ends the completion."""

@@ -180,7 +180,7 @@ def test_a_slot_that_changes_hands_is_copied_first(monkeypatch: pytest.MonkeyPat
     takes = Job("a", [*base[:20], *range(100, 200)], one)
     joining = [takes]
 
-    def exchange(done: Sequence[Job]) -> list[Job]:
+    def exchange(done: Sequence[Job], rest: int) -> list[Job]:
         return [joining.pop() for job in done if job is first]
 
     llm._engine.run([first, copies], exchange)
