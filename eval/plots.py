@@ -40,10 +40,7 @@ def reward_curve(
     if len(points) >= window > 1:
         axes.plot(steps, running_mean(values, window), linewidth=2, label=f"mean of {window}")
         axes.legend()
-    axes.set_xlabel("step")
-    axes.set_ylabel(key)
-    axes.set_title(title or f"{key} while training")
-    axes.grid(alpha=0.3)
+    _label(axes, key, title)
     _save(figure, path)
     return True
 
@@ -76,10 +73,7 @@ def learning_curves(
     if not drawn:
         return False
     axes.legend()
-    axes.set_xlabel("step")
-    axes.set_ylabel(key)
-    axes.set_title(title or f"{key} while training")
-    axes.grid(alpha=0.3)
+    _label(axes, key, title)
     _save(figure, path)
     return True
 
@@ -139,6 +133,13 @@ def _panel(
     axes.set_xticks(range(len(scaffolds)), scaffolds, rotation=20, ha="right")
     axes.set_yticks(range(len(policies)), policies)
     figure.colorbar(image, ax=axes)
+
+
+def _label(axes: Any, key: str, title: str) -> None:
+    axes.set_xlabel("step")
+    axes.set_ylabel(key)
+    axes.set_title(title or f"{key} while training")
+    axes.grid(alpha=0.3)
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
