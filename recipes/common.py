@@ -119,3 +119,7 @@ def run_recipe(main: Callable[[], None]) -> None:
 
     with expected_errors():
         main()
+        if "torch" in sys.modules:  # not for `--help`
+            from trainers.distributed import leave_group
+
+            leave_group()

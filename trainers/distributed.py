@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import torch
 from trl.distributed import DistributedBackend
 
 from agentspec.registry import SpecError
@@ -98,3 +99,12 @@ def check_trained(
         f"no call of this generation batch matched train_calls {config.train_calls} with credits "
         f"{config.train_credits}; the scaffold called {sorted(set().union(*(called for _, _, called in ranks)))}"
     )
+
+
+def leave_group() -> None:
+    """Leave the process group, if this process is in one; the last thing a script does.
+
+    Threads of a group that is still open when the interpreter ends can abort it, and the launcher calls that a failure.
+    """
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()

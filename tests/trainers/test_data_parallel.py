@@ -34,6 +34,7 @@ from tests.trainers.builders import call, episode
 from trainers import grpo as grpo_module
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
+from trainers.distributed import leave_group
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import load_state
 from trainers.rollouts import collect, task_rows
@@ -221,3 +222,4 @@ def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:
 
 if __name__ == "__main__":
     run_cases(Path(sys.argv[1]), int(sys.argv[2]))
+    leave_group()

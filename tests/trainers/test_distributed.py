@@ -36,7 +36,7 @@ from tests.trainers.test_data_parallel import built_episode, make_trainer
 from tests.trainers.test_supo import configured
 from trainers import grpo as grpo_module
 from trainers import tree
-from trainers.distributed import check_layout, check_trained, keep_precision
+from trainers.distributed import check_layout, check_trained, keep_precision, leave_group
 from trainers.runlog import RunLog
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -325,3 +325,4 @@ if __name__ == "__main__":
         step_in_bfloat16()
     else:
         run_cases(Path(sys.argv[2]), sys.argv[3])
+    leave_group()
