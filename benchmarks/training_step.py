@@ -66,8 +66,9 @@ def make_rows(layout: str, rollouts: int, turns: int, vocabulary: int, seed: int
 def _trained(sequence: Any, tokens: Sequence[int]) -> None:
     start = len(sequence)
     sequence.extend_context(list(tokens))
+    sequence.paths[0] = "reasoning.direct/act"
     for p in range(start, len(sequence)):
-        sequence.mask[p] = 1
+        sequence.mask[p], sequence.calls[p] = 1, 0
 
 
 def stock_update(trainer: Any, rows: Sequence[Any], micro: int) -> Callable[[], None]:
