@@ -116,8 +116,7 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
         own: method -> label of the scaffold it was trained in.
     """
     from eval.metrics import BY_NAME, primary_metric
-    from eval.statistics import bootstrap, crossed_bootstrap
-    from eval.tables import show, table, values_by_task
+    from eval.tables import table, values_by_task
 
     metric = primary_metric(list(rows))
     digits = BY_NAME[metric].digits
@@ -130,16 +129,9 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
     body = []
     for method, numbers in seeds.items():
         for scaffold in scaffolds:
-            policies = [f"{method}-s{n}" for n in numbers]
-            held = [cells[p, scaffold] for p in (START, *policies)]
-            tasks = [t for t in held[0] if all(t in values for values in held)]
-            gained = [[values[t] - held[0][t] for t in tasks] for values in held[1:]]
-            before = bootstrap([held[0][t] for t in tasks])
-            after = crossed_bootstrap([[values[t] for t in tasks] for values in held[1:]])
+            before, *after = (cells[p, scaffold] for p in (START, *(f"{method}-s{n}" for n in numbers)))
             where = f"{scaffold} (its own)" if scaffold == own[method] else scaffold
-            each = ", ".join(show(bootstrap(g), digits) for g in gained)
-            pooled = show(crossed_bootstrap(gained), digits)
-            body.append([method, where, show(before, digits), show(after, digits), pooled, each, str(len(tasks))])
+            body.append([method, where, *_compared(before, after, digits)])
     header = [
         "trained with",
         "evaluated in",
@@ -159,6 +151,19 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
         "",
     ]
     return "\n".join(lines)
+
+
+def _compared(before: Mapping[str, float], after: Sequence[Mapping[str, float]], digits: int) -> list[str]:
+    """Cells of one row, from values by task of the start and of each run; a task that any of them lacks is left out."""
+    from eval.statistics import bootstrap, crossed_bootstrap
+    from eval.tables import show
+
+    tasks = [t for t in before if all(t in values for values in after)]
+    gained = [[values[t] - before[t] for t in tasks] for values in after]
+    start = bootstrap([before[t] for t in tasks])
+    end = crossed_bootstrap([[values[t] for t in tasks] for values in after])
+    each = ", ".join(show(bootstrap(g), digits) for g in gained)
+    return [*(show(e, digits) for e in (start, end, crossed_bootstrap(gained))), each, str(len(tasks))]
 
 
 if __name__ == "__main__":

@@ -29,10 +29,9 @@ class CallTotals:
     entropy: float = 0.0
     clipped: int = 0
 
-    def __iadd__(self, other: CallTotals) -> CallTotals:
-        for f in fields(self):
-            setattr(self, f.name, getattr(self, f.name) + getattr(other, f.name))
-        return self
+    def plus(self, other: CallTotals) -> CallTotals:
+        """The totals of both."""
+        return CallTotals(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 class CallMetrics:
@@ -71,7 +70,7 @@ class CallMetrics:
         """
         everywhere: dict[str, CallTotals] = {}
         for path, totals in gather(list(self._totals.items())):
-            everywhere.setdefault(path, CallTotals()).__iadd__(totals)
+            everywhere[path] = everywhere.get(path, CallTotals()).plus(totals)
         self._totals = {}
         mass = sum(t.advantage for t in everywhere.values())
         metrics: dict[str, float] = {}
