@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action as Act
@@ -17,6 +18,18 @@ from agentspec.types import (
     Task,
     Transition,
 )
+
+CPU_RUN: dict[str, Any] = {
+    "learning_rate": 1e-2,
+    "optim": "adamw_torch",
+    "report_to": [],
+    "use_cpu": True,
+    "bf16": False,
+    "gradient_checkpointing": False,
+    "logging_steps": 1,
+    "disable_tqdm": True,
+}
+"""Settings of a short, silent run on a CPU, as tests of the trainers make them."""
 
 
 def call(

@@ -11,6 +11,7 @@ from datasets import Dataset
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
+from tests.trainers.builders import CPU_RUN
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.rollouts import task_rows
@@ -32,14 +33,7 @@ def toy_trainer(
         "num_generations": 2,
         "max_steps": 2,
         "save_strategy": "no",
-        "learning_rate": 1e-2,
-        "optim": "adamw_torch",
-        "report_to": [],
-        "use_cpu": True,
-        "bf16": False,
-        "gradient_checkpointing": False,
-        "logging_steps": 1,
-        "disable_tqdm": True,
+        **CPU_RUN,
         "shuffle_dataset": False,
         **changes,
     }

@@ -16,7 +16,7 @@ from datasets import Dataset
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
-from tests.trainers.builders import call, episode
+from tests.trainers.builders import CPU_RUN, call, episode
 from trainers.audit import audit
 from trainers.batches import Row
 from trainers.config import ScaffoldConfig
@@ -36,14 +36,7 @@ def trainer(folder: Path, *, held_out: Sequence[Task] = (), **changes: Any) -> S
         "num_generations": 2,
         "max_steps": 4,
         "save_steps": 1,
-        "learning_rate": 1e-2,
-        "optim": "adamw_torch",
-        "report_to": [],
-        "use_cpu": True,
-        "bf16": False,
-        "gradient_checkpointing": False,
-        "logging_steps": 1,
-        "disable_tqdm": True,
+        **CPU_RUN,
         **changes,
     }
     tokenizer = tiny_tokenizer()

@@ -23,7 +23,7 @@ from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Task
 from rewards import RewardSet
 from tests.tiny import tiny_model, tiny_tokenizer
-from tests.trainers.builders import call, episode
+from tests.trainers.builders import CPU_RUN, call, episode
 from tests.trainers.played import toy_tasks
 from tests.trainers.test_resume import _stop_after
 from trainers.audit import audit
@@ -72,14 +72,7 @@ def config(folder: Path, folders: dict[str, str], **changes: Any) -> ScaffoldCon
         "num_generations": 4,
         "max_steps": 2,
         "save_strategy": "no",
-        "learning_rate": 1e-2,
-        "optim": "adamw_torch",
-        "report_to": [],
-        "use_cpu": True,
-        "bf16": False,
-        "gradient_checkpointing": False,
-        "logging_steps": 1,
-        "disable_tqdm": True,
+        **CPU_RUN,
         "shuffle_dataset": False,
         **changes,
     }
