@@ -204,8 +204,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         )
         for name, value in weighed.metrics.items():
             self._metrics["train"][name].append(value)
-        check_trained(self._episodes, self.args, gather_object)
+        self._check_trained()
         return weighed.rows
+
+    def _check_trained(self) -> None:
+        """Refuse a generation batch that trains nothing, on all ranks together."""
+        check_trained(self._episodes, self.args, gather_object)
 
     def _carried_memory(self) -> bytes | None:
         """With ``scope: run``: the memory that the next round starts from, the same on every rank."""

@@ -21,6 +21,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from accelerate.utils import gather_object
 from torch import nn
 
 from agentspec.episode import Job
@@ -30,7 +31,6 @@ from agentspec.reflection.retroformer import PATH
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.trajectory import Trajectory, write_trajectories
-from trainers.batches import Row
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
@@ -131,13 +131,10 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         """None: every round's first trials are first trials."""
         return None
 
-    def _rows(self) -> list[Row]:
-        try:
-            return super()._rows()
-        except SpecError:
-            if any(map(has_lesson, self._episodes)):
-                raise
-            return []  # no first trial failed: there is nothing to learn from this round
+    def _check_trained(self) -> None:
+        """As for any run, unless no first trial of any rank failed: then there is nothing to learn from this round."""
+        if any(gather_object([any(map(has_lesson, self._episodes))])):
+            super()._check_trained()
 
     def _log_episodes(self) -> None:
         """As for any run; also what the lessons were worth, and the trials they are about."""
