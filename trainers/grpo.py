@@ -393,7 +393,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         return metrics
 
 
-def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "ordered") -> LLM:
+def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
     """The local backend over the live policy."""
     from agentspec.llm.local import LocalLLM
 

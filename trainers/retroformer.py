@@ -195,7 +195,7 @@ def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
     return replace(spec, reflection=ModuleSpec(spec.reflection.name, params), sampling=sampling)
 
 
-def routed_llm(model: nn.Module, tokenizer: Any, batching: Any = "ordered") -> LLM:
+def routed_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
     """The local backend: lessons come from the trained adapter, everything else from the actor's."""
     from agentspec.llm.local import LocalLLM
 

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from os import PathLike
-from typing import Any
+from typing import Any, Literal
 
 from agentspec.llm.base import LLMError, Message, Request, require_context
 from agentspec.llm.batching import Batcher, Batching
@@ -41,9 +41,10 @@ class LocalLLM:
         max_context: context window; by default the model's.
         template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
         patience_s: see :class:`~agentspec.llm.batching.Batcher`.
-        batching: see :data:`~agentspec.llm.batching.Batching`. By default batches are continuous and runs repeatable.
-            Where answers are long and environments take several times as long as a forward of the model, ``"eager"``
-            is faster, or, if runs must be repeatable, ``"closed"``.
+        batching: see :data:`~agentspec.llm.batching.Batching`. ``"auto"`` is ``"eager"`` where that is repeatable (the
+            model's arithmetic is found to be batch-invariant: float32 on a CPU with MKL), else ``"ordered"``. There,
+            if answers are long and environments take several times as long as a forward of the model, ``"eager"`` is
+            faster, or, if runs must be repeatable, ``"closed"``.
         adapters: which adapter of a PEFT model answers which calls: shell pattern over the call's tag path -> name,
             first match wins (see :mod:`~agentspec.llm.local_adapters`), e.g.
             ``{"reflection.retroformer/*": "reflector", "*": "actor"}``. What matches nothing is answered by the
@@ -69,7 +70,7 @@ class LocalLLM:
         template_kwargs: Mapping[str, Any] | None = None,
         patience_s: float = 60.0,
         adapters: Mapping[str, str] | None = None,
-        batching: Batching = "ordered",
+        batching: Batching | Literal["auto"] = "auto",
     ) -> None:
         self.name = name
         self.model = model
@@ -87,7 +88,9 @@ class LocalLLM:
             max_batch=max_batch,
             max_cache_tokens=max_cache_tokens,
         )
-        self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s, batching=batching)
+        self._choose_batching = batching == "auto"
+        first: Batching = "ordered" if batching == "auto" else batching
+        self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s, batching=first)
         self._left: deque[str] = deque()
         self._trie = lru_cache(maxsize=512)(self._make_trie)
 
@@ -205,6 +208,8 @@ class LocalLLM:
             return joining
 
         try:
+            if self._choose_batching:
+                self._batcher.batching = "eager" if self._engine.model.invariant() else "ordered"
             self._engine.run(jobs, exchange)
         except LLMError:
             raise

@@ -5,8 +5,11 @@ segment's new keys and values are stored in its slot, and its queries attend to 
 key-value head are laid side by side as more queries of that head, so that keys and values are read once and never
 repeated.
 
-On a CPU segments go one by one. On an accelerator, where a launch costs more than the work, the segments of one token
-(sequences that are writing) are gathered into one padded batch.
+On a CPU segments go one by one, each against whole blocks of keys of which those to come are hidden: then the order in
+which a token's keys are summed up depends on its position alone, not on how many tokens are read at once, and the same
+token in the same context has the same keys, values and logits, bit for bit, whoever else is in the batch. On an
+accelerator, where a launch costs more than the work, the segments of one token (sequences that are writing) are
+gathered into one padded batch.
 """
 
 from __future__ import annotations
@@ -26,6 +29,13 @@ from agentspec.llm.local_cache import Slot
 _ACTIVE = threading.local()
 _BATCHED_FROM = {"cpu": 1 << 30}
 _BATCHED_FROM_DEFAULT = 4
+_KEYS = {"cpu": 512}
+"""Keys that torch's attention kernel takes at a time."""
+
+
+def slot_block(device: torch.device) -> int:
+    """What the capacity of slots on ``device`` must be a multiple of."""
+    return _KEYS.get(device.type, 64)
 
 
 @dataclass
@@ -138,10 +148,12 @@ def _one(pack: Pack, segment: Segment, layer: int, query: torch.Tensor, scores: 
     heads, n = query.shape[1], query.shape[2]
     total = segment.start + n
     keys, values = segment.slot.layer(layer)
+    block = _KEYS.get(query.device.type, 1)
+    padded = min(-(-total // block) * block, segment.slot.capacity)
     groups = heads // keys.shape[0]
     q = query.reshape(1, keys.shape[0], groups * n, -1)
-    mask = _causal_mask(pack, n, total, groups, scores.window, q)
-    o = _attend(q, keys[None, :, :total], values[None, :, :total], mask, groups, scores)
+    mask = _causal_mask(pack, n, total, padded, groups, scores.window, q)
+    o = _attend(q, keys[None, :, :padded], values[None, :, :padded], mask, groups, scores)
     return o.reshape(heads, n, -1).transpose(0, 1)
 
 
@@ -162,18 +174,20 @@ def _batch(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Ten
     return _attend(q, k, v, mask, groups, scores).reshape(len(segments), query.shape[0], -1)
 
 
-def _causal_mask(pack: Pack, n: int, total: int, groups: int, window: int, like: torch.Tensor) -> torch.Tensor | None:
-    """Additive mask (groups * n, total) of the last ``n`` of ``total`` positions; ``None`` if nothing is hidden."""
-    if n == 1 and not 0 < window < total:
+def _causal_mask(
+    pack: Pack, n: int, total: int, padded: int, groups: int, window: int, like: torch.Tensor
+) -> torch.Tensor | None:
+    """Additive mask (groups * n, padded) of the last ``n`` of ``total`` positions; ``None`` if nothing is hidden."""
+    if n == 1 and padded == total and not 0 < window < total:
         return None
     cached = pack.masks.get((n, total, groups, window))
     if cached is None:
         here = torch.arange(total - n, total, device=like.device)[:, None]
-        there = torch.arange(total, device=like.device)[None]
+        there = torch.arange(padded, device=like.device)[None]
         hidden = there > here
         if window:
             hidden |= there <= here - window
-        mask = torch.zeros(n, total, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
+        mask = torch.zeros(n, padded, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
         cached = pack.masks[n, total, groups, window] = mask.repeat(groups, 1)
     return cached
 

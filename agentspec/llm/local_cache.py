@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-_ROUND = 64
 _GROWTH = 1.25
 _BONUS = 16
 
@@ -30,15 +29,17 @@ class Slot:
     """Keys and values of ``tokens[:length]``.
 
     ``keys[layer]`` and ``values[layer]`` are buffers of shape (key-value heads, capacity, head size), allocated when a
-    layer first writes; only the first ``length`` positions are meaningful.
+    layer first writes; only the first ``length`` positions are meaningful, the others are finite. ``capacity`` is a
+    multiple of ``block``.
     """
 
-    __slots__ = ("adapter", "capacity", "epoch", "keys", "length", "owner", "tokens", "used", "values")
+    __slots__ = ("adapter", "block", "capacity", "epoch", "keys", "length", "owner", "tokens", "used", "values")
 
-    def __init__(self, layers: int, capacity: int) -> None:
+    def __init__(self, layers: int, capacity: int, block: int = 64) -> None:
         self.keys: list[torch.Tensor | None] = [None] * layers
         self.values: list[torch.Tensor | None] = [None] * layers
-        self.capacity = _round_up(capacity)
+        self.block = block
+        self.capacity = _round_up(capacity, block)
         self.length = 0
         self.tokens = np.empty(0, np.int32)
         self.owner: str | None = None
@@ -50,11 +51,11 @@ class Slot:
         """Make room for ``capacity`` positions, keeping the first ``length``; grows by a quarter at least."""
         if capacity <= self.capacity:
             return
-        self.capacity = _round_up(max(capacity, int(self.capacity * _GROWTH)))
+        self.capacity = _round_up(max(capacity, int(self.capacity * _GROWTH)), self.block)
         for buffers in (self.keys, self.values):
             for i, old in enumerate(buffers):
                 if old is not None:
-                    new = old.new_empty(old.shape[0], self.capacity, old.shape[2])
+                    new = old.new_zeros(old.shape[0], self.capacity, old.shape[2])
                     new[:, : self.length] = old[:, : self.length]
                     buffers[i] = new
 
@@ -86,8 +87,8 @@ class Slot:
     def _buffers(self, layer: int, key: torch.Tensor, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         keys, values = self.keys[layer], self.values[layer]
         if keys is None or values is None:
-            keys = self.keys[layer] = key.new_empty(key.shape[0], self.capacity, key.shape[2])
-            values = self.values[layer] = value.new_empty(value.shape[0], self.capacity, value.shape[2])
+            keys = self.keys[layer] = key.new_zeros(key.shape[0], self.capacity, key.shape[2])
+            values = self.values[layer] = value.new_zeros(value.shape[0], self.capacity, value.shape[2])
         return keys, values
 
 
@@ -100,10 +101,13 @@ class Match:
 
 
 class PrefixCache:
-    """Slots of finished calls, found by prefix, bounded by ``max_tokens`` positions (live calls count too)."""
+    """Slots of finished calls, found by prefix, bounded by ``max_tokens`` positions (live calls count too); a slot's
+    capacity is a multiple of ``block``.
+    """
 
-    def __init__(self, layers: int, max_tokens: int) -> None:
+    def __init__(self, layers: int, max_tokens: int, block: int = 64) -> None:
         self.layers = layers
+        self.block = block
         self.max_tokens = max_tokens
         self._slots: list[Slot] = []
         self._clock = 0
@@ -156,7 +160,7 @@ class PrefixCache:
                     taken[i] = slot
             found: list[Slot] = []
             for i, (match, (_, _, _, capacity)) in enumerate(zip(matches, prompts, strict=True)):
-                slot = taken.get(i) or Slot(self.layers, capacity)
+                slot = taken.get(i) or Slot(self.layers, capacity, self.block)
                 if i not in taken and match.slot is not None:
                     slot.copy_prefix(match.slot, match.length)
                 found.append(slot)
@@ -221,5 +225,5 @@ def common_prefix(a: np.ndarray, b: np.ndarray) -> int:
     return first if differs[first] else n
 
 
-def _round_up(n: int) -> int:
-    return -(-n // _ROUND) * _ROUND
+def _round_up(n: int, block: int) -> int:
+    return -(-n // block) * block

@@ -18,6 +18,7 @@ from itertools import pairwise
 import torch
 
 from agentspec.llm.local_adapters import active_adapter, using
+from agentspec.llm.local_attention import slot_block
 from agentspec.llm.local_cache import PrefixCache
 from agentspec.llm.local_forward import PackedModel, Segment
 from agentspec.llm.local_lineup import Lineup
@@ -52,7 +53,7 @@ class Engine:
         max_cache_tokens: int,
     ) -> None:
         self.model = model
-        self.cache = PrefixCache(model.layers, max_cache_tokens)
+        self.cache = PrefixCache(model.layers, max_cache_tokens, slot_block(model.device))
         self._stop_ids = stop_ids
         self._decode = decode
         self._max_batch = max_batch

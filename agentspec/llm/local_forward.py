@@ -7,6 +7,10 @@ segment look at its own slot only. So a batch of unequal prompts costs exactly i
 of one batch share is computed once and copied, and reading a prompt, decoding and forced runs of tokens are the same
 operation.
 
+What a segment's logits are does not depend on what else is in the row, but for rounding. On CPUs it does not even by
+that, where matrix products treat rows alike (MKL does when asked to, see :mod:`agentspec`):
+:meth:`PackedModel.invariant` tries it out.
+
 It works with every decoder that uses the attention interface of transformers, whatever its weights (float types, LoRA
 adapters); :meth:`PackedModel.check` compares it with the model's ordinary forward before its first use.
 """
@@ -21,11 +25,12 @@ from typing import Any
 import torch
 
 from agentspec.llm.base import LLMError
-from agentspec.llm.local_attention import Pack, Segment, active, packed_attention
+from agentspec.llm.local_attention import Pack, Segment, active, packed_attention, slot_block
 from agentspec.llm.local_cache import Slot
 
 _ATTENTION = "agentspec_packed"
 _LAYER_TYPES = frozenset({"full_attention", "sliding_attention", "attention"})
+_CHUNKS = (1, 2, 5, 17, 30, 1, 41)
 
 
 class PackedModel:
@@ -52,6 +57,7 @@ class PackedModel:
         self.max_context = int(getattr(text, "max_position_embeddings", None) or 1 << 30)
         self._keeps = "logits_to_keep" in parameters
         self._checked = False
+        self._invariant: bool | None = None
 
     @property
     def device(self) -> torch.device:
@@ -121,7 +127,7 @@ class PackedModel:
         vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
         tokens = [(7 * i * i + 3 * i + 1) % vocabulary for i in range(12)]
         with self.session():
-            slots = [Slot(self.layers, 16), Slot(self.layers, 16)]
+            slots = [Slot(self.layers, 16, slot_block(self.device)) for _ in range(2)]
             packed = [
                 self.forward([Segment(slots[0], tokens[:5], 0)]),
                 # The rest of the first, packed beside a second sequence that copies its beginning.
@@ -143,6 +149,28 @@ class PackedModel:
                 "serve the model (vLLM) and use the `openai` backend"
             )
         self._checked = True
+
+    def invariant(self) -> bool:
+        """Whether a token's logits are the same, to the last bit, however many others are computed with it.
+
+        Found out once, by reading a text whole and in pieces beside another.
+        """
+        if self._invariant is None:
+            self.check()
+            vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
+            text, other = ([(7 * i * i + a * i + 1) % vocabulary for i in range(sum(_CHUNKS))] for a in (3, 5))
+            whole, pieces, beside = (Slot(self.layers, len(text), slot_block(self.device)) for _ in range(3))
+            start, equal = 0, True
+            with self.session():
+                (expected,) = self.forward([Segment(whole, text, 0, len(text))])
+                for n in _CHUNKS:
+                    stop = start + n
+                    segments = [Segment(pieces, text[start:stop], start, n), Segment(beside, other[start:stop], start)]
+                    # The first is read alone.
+                    equal &= torch.equal(self.forward(segments[: 1 + bool(start)])[0], expected[start:stop])
+                    start = stop
+            self._invariant = equal
+        return self._invariant
 
 
 @contextmanager

@@ -8,6 +8,7 @@ sample's index: what a row samples does not depend on what it is batched with.
 
 from __future__ import annotations
 
+import math
 import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -91,15 +92,20 @@ class ScoreRow(Row):
         # The last token predicts nothing that is asked for.
         self.tokens.extend(continuation[:-1])
         self._targets = list(continuation)
-        self.total = 0.0
+        self._logprobs: list[float] = []
         self.done = not continuation
+
+    @property
+    def total(self) -> float:
+        """Log-probability of the continuation; the same however it was read in pieces."""
+        return math.fsum(self._logprobs)
 
     def feed(self, logits: torch.Tensor) -> None:
         """Logits (n, V) of the next ``n`` wanted positions."""
         n = logits.shape[0]
         targets = torch.tensor(self._targets[:n], device=logits.device)
         chosen = logits.gather(1, targets[:, None])[:, 0] - logits.logsumexp(-1)
-        self.total += float(chosen.double().sum())
+        self._logprobs += chosen.double().tolist()
         del self._targets[:n]
         self.wanted += n
         self.done = not self._targets

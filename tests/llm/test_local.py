@@ -158,7 +158,7 @@ def test_choices_are_sampled_by_their_probability():
 
 
 def test_single_choice_needs_no_model(monkeypatch):
-    llm = tiny()
+    llm = tiny(batching="ordered")
     monkeypatch.setattr(llm._engine.model, "forward", None)
     monkeypatch.setattr(llm._engine.model, "check", lambda: None)
     (completion,) = ask(llm, choices=("go",)).completions
