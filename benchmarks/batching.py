@@ -8,13 +8,13 @@ continuous ones (see :mod:`agentspec.llm.batching`). Every answer has its own nu
 it is batched. Modes take turns in one process; reported are median seconds, forwards of the model (which do not depend
 on the machine), and ``ratio``, the closed batch's seconds over the others'.
 
-``same_answers`` is the share of answers that are, token by token, those of closed batches, and ``same_bits`` says that all
-repeats agree to the last bit of all log-probabilities. Both are promised where arithmetic is batch-invariant (float32 on
-a CPU with MKL). Elsewhere which rows share a forward changes the rounding of its logits, that moves the border between two
-of the many improbable tokens, and now and then one is drawn there; from then on the episode differs, and ``eager``, where
-timing decides who shares a forward, does not repeat. The second part,
-``slow_env``, is the same with environments that take ``--delay`` seconds a call and a tiny random model: there the
-model should not wait for the environments.
+``same_answers`` is the share of answers that are, token by token, those of closed batches, and ``same_bits`` says that
+all repeats agree to the last bit of all log-probabilities. Both are promised where arithmetic is batch-invariant
+(float32 on a CPU with MKL). Elsewhere which rows share a forward changes the rounding of its logits, that moves the
+border between two of the many improbable tokens, and now and then one is drawn there; from then on the episode differs,
+and ``eager``, where timing decides who shares a forward, does not repeat. The second part, ``slow_env``, is the same
+with environments that take ``--delay`` seconds a call and a tiny random model: there the model should not wait for the
+environments.
 """
 
 from __future__ import annotations
