@@ -1,4 +1,4 @@
-"""A run is a function of its configuration: how fast its environments are and how its requests are batched is no part."""
+"""A run is a function of its configuration, not of how fast environments are or how requests are batched."""
 
 from __future__ import annotations
 
