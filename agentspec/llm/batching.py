@@ -14,7 +14,8 @@ the others write, and takes new requests in between two steps of the work:
   on the work alone, never on timing, so a run can be repeated to the last bit, as with closed batches. The price is
   that the model stands still while the last of the quarter act: when answers are long, and environments take much
   longer than a step of the model, ``closed`` is faster.
-- ``eager`` takes in whoever asks, and waits for nobody: the fastest, most of all with slow environments. Who is in the
+- ``eager`` takes in whoever asks, and waits for nobody, or for a moment where episodes usually come back within one
+  (:mod:`agentspec.llm.pace`): the fastest, most of all with slow environments. Who is in the
   batch depends on timing. Where arithmetic is batch-invariant
   (:meth:`~agentspec.llm.local_forward.PackedModel.invariant`) nothing else does, and a run can be repeated to the last
   bit all the same; elsewhere the batch's rounding makes a rerun differ in the last bits and, now and then, in a token.
@@ -28,10 +29,13 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, Literal, TypeVar, get_args
+
+from agentspec.llm.pace import Pace
 
 T = TypeVar("T")
 Batching = Literal["ordered", "eager", "closed"]
@@ -89,6 +93,8 @@ class Batcher(Generic[T]):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._driver: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
+        self._pace = Pace()
+        self._resumed = 0.0
         self._thread = concurrent.futures.ThreadPoolExecutor(max_workers=1, thread_name_prefix="agentspec-llm")
 
     def enter(self, episode: str) -> None:
@@ -109,6 +115,7 @@ class Batcher(Generic[T]):
         count = self._live.pop(episode, 0)
         if count > 1 and not every:
             self._live[episode] = count - 1
+        self._pace.ended(episode)
         self._wake()
 
     async def submit(self, episode: str, number: int, job: T) -> None:
@@ -121,6 +128,7 @@ class Batcher(Generic[T]):
         loop = asyncio.get_running_loop()
         pending = _Pending(episode, number, job, loop.create_future())
         self._pending.append(pending)
+        self._pace.asked(episode)
         self._wake()
         try:
             await pending.done
@@ -143,6 +151,13 @@ class Batcher(Generic[T]):
         Raises:
             asyncio.CancelledError: nobody waits for the batch any more.
         """
+        self._pace.worked(time.perf_counter() - self._resumed)
+        try:
+            return self._exchange_in_loop(done, rest)
+        finally:
+            self._resumed = time.perf_counter()
+
+    def _exchange_in_loop(self, done: Sequence[T], rest: int) -> list[T]:
         idle = not done and not (self.batching == "eager" and self._pending)
         if self.batching == "closed" or idle or self._working is None:
             return []
@@ -171,7 +186,8 @@ class Batcher(Generic[T]):
             out = batch.episodes - self._episodes(batch)
             ordered = rest > _NEARLY_DONE and out >= max(1, _SHARE * batch.episodes)
             due = self.batching == "eager" or ordered
-            patient = await self._wait(lambda: self._batch is not batch or not due or self._may_go_on())
+            enough = partial(self._may_join, batch, due and delivered)
+            patient = await self._wait(enough)
             # A batch of strangers alone, who wait for nobody, must not keep the live episodes out.
             everybody = due or not patient or (not batch.episodes and self._complete())
             if self._batch is batch:
@@ -201,7 +217,7 @@ class Batcher(Generic[T]):
         ready = [p for p in batch.jobs if p.finished and p.episode not in busy]
         batch.jobs = [p for p in batch.jobs if not p.finished or p.episode in busy]
         for p in ready:
-            _settle(p.done, None)
+            self._settle(p, None)
         return bool(ready)
 
     def _task_ended(self, episode: str, live: dict[str, int], _: object) -> None:
@@ -229,7 +245,7 @@ class Batcher(Generic[T]):
         """Run batches while anybody asks."""
         while self._pending:
             patient = await self._wait(self._may_start)
-            if jobs := self._take(self._may_go_on() or not patient):
+            if jobs := self._take(self.batching == "eager" or self._complete() or not patient):
                 await self._work_off(jobs)
 
     async def _work_off(self, jobs: list[_Pending[T]]) -> None:
@@ -248,24 +264,31 @@ class Batcher(Generic[T]):
             if self._batch is batch:
                 self._batch = None
             for p in batch.jobs:
-                _settle(p.done, error)
+                self._settle(p, error)
+
+    def _settle(self, pending: _Pending[T], error: BaseException | None) -> None:
+        self._pace.answered(pending.episode)
+        _settle(pending.done, error)
 
     def _work(self, batch: _Batch[T]) -> None:
         self._working = batch
+        self._resumed = time.perf_counter()
         self._run([p.job for p in batch.jobs])
 
     async def _wait(self, enough: Callable[[], bool]) -> bool:
         """Until there is ``enough``, and still is a few turns later; whether patience lasted."""
+        patience = self._pace.grace_s if self.batching == "eager" else self._patience
         while True:
             self._changed.clear()
-            if enough():
+            satisfied = enough()
+            if satisfied or not patience:
                 for _ in range(_TURNS):
                     await asyncio.sleep(0)
-                if enough():
-                    return True
+                if enough() or not patience:
+                    return satisfied
             else:
                 try:
-                    await asyncio.wait_for(self._changed.wait(), self._patience)
+                    await asyncio.wait_for(self._changed.wait(), patience)
                 except TimeoutError:
                     return False
 
@@ -280,12 +303,12 @@ class Batcher(Generic[T]):
         jobs = self._batch.jobs if self._batch else []
         return self._live.keys() <= {p.episode for p in [*self._pending, *jobs]}
 
-    def _may_go_on(self) -> bool:
-        return self.batching == "eager" or self._complete()
+    def _may_join(self, batch: _Batch[T], worth_waiting: bool) -> bool:
+        return self._batch is not batch or not worth_waiting or self._complete()
 
     def _may_start(self) -> bool:
         """Nothing is gained by waiting (also: nothing is left to run)."""
-        return not self._pending or self._may_go_on() or any(p.episode not in self._live for p in self._pending)
+        return not self._pending or self._complete() or any(p.episode not in self._live for p in self._pending)
 
 
 def _settle(done: asyncio.Future[None], error: BaseException | None) -> None:
