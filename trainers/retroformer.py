@@ -120,6 +120,11 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         super().__init__(model, args, make_llm=make_llm or partial(routed_llm, batching=args.batching), **kwargs)
         self._first_trials: list[Trajectory] = []
 
+    def _load_from_checkpoint(self, resume_from_checkpoint: str, model: Any = None) -> None:
+        """As transformers does; its older versions leave out an adapter that lies beside the folder of another."""
+        super()._load_from_checkpoint(resume_from_checkpoint, model)
+        (model or self.model).load_adapter(resume_from_checkpoint, TRAINED, is_trainable=True)
+
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
         runner = self._runner(spec or acting_scaffold(self.args))
         self._first_trials, episodes = play_trials(
