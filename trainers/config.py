@@ -145,6 +145,8 @@ class ScaffoldConfig(GRPOConfig):
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
+        if getattr(self, "bf16", None) is None and self.use_cpu:
+            self.bf16 = False  # TRL's default would round log-probabilities to 16 bits, and is slower on a CPU
         super().__post_init__()
 
     @property

@@ -1,24 +1,30 @@
 """vLLM on a GPU machine, through the engine that TRL keeps in step with the policy.
 
 TRL starts vLLM (colocated, or as a server), and pushes the trainer's weights into it. This backend sends it the
-scaffold's prompts as token ids, all live episodes at once, with each request's own sampling parameters and seed, and
-takes back tokens and log-probabilities. The log-probabilities are those after temperature (``processed_logprobs``).
-Constrained choices are not offered: vLLM's grammar may spell a text in other tokens than ours, and the record of what
-was allowed would be wrong; use native actions.
+scaffold's prompts as token ids, each request with its own sampling parameters and seed, as episodes ask, and takes back
+tokens and log-probabilities as they are finished: vLLM writes for many at once, and nobody waits for anybody else's
+answer. The log-probabilities are those after temperature (``processed_logprobs``). Constrained choices are not offered:
+vLLM's grammar may spell a text in other tokens than ours, and the record of what was allowed would be wrong; use native
+actions.
 """
 
 from __future__ import annotations
 
+import asyncio
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 from agentspec.llm.base import LLMError, Message, Request, require_context
 from agentspec.llm.batching import Batcher
 from agentspec.llm.chat import chat_format
 from agentspec.types import Completion, LLMCall, Sampling, Usage
+
+REQUESTS = 64
+"""Most requests to a server at once: as many connections as TRL's client keeps."""
 
 
 @dataclass(frozen=True)
@@ -30,26 +36,32 @@ class Sampled:
     finish_reason: str
 
 
-REQUESTS = 64
-"""Most requests to a server at once: as many connections as TRL's client keeps."""
+@dataclass(eq=False)
+class Job:
+    """A prompt and how to continue it; ``samples`` is filled in."""
 
-Engine = Callable[[Sequence[Sequence[int]], Sequence[Sampling], Sequence[int]], list[list[Sampled]]]
-"""prompts, sampling parameters and seeds, one each -> samples of each prompt."""
-
-
-@dataclass
-class _Job:
     prompt: tuple[int, ...]
     sampling: Sampling
     seed: int
     samples: list[Sampled] = field(default_factory=list)
 
 
+class Engine(Protocol):
+    """What runs jobs. ``enter`` and ``leave`` tell it which episodes are live."""
+
+    async def sample(self, episode: str, number: int, job: Job) -> None:
+        """Fill in ``job.samples``, ``sampling.n`` of them."""
+
+    def enter(self, episode: str) -> None: ...
+
+    def leave(self, episode: str) -> None: ...
+
+
 class VLLMBackend:
     """An :class:`~agentspec.llm.base.LLM` over a vLLM engine.
 
     Args:
-        engine: see :data:`Engine`; :func:`trl_backend` makes one of TRL's.
+        engine: see :class:`Engine`; :func:`trl_backend` makes one of TRL's.
         tokenizer: the policy's.
         max_context: longest prompt plus answer.
     """
@@ -62,7 +74,6 @@ class VLLMBackend:
         self._engine = engine
         self._tokenizer = tokenizer
         self._format = chat_format(tokenizer)
-        self._batcher: Batcher[_Job] = Batcher(self._run)
 
     async def generate(self, request: Request) -> LLMCall:
         """Sample from vLLM (see :class:`~agentspec.llm.base.LLM`)."""
@@ -71,17 +82,15 @@ class VLLMBackend:
         start = time.perf_counter()
         prompt = tuple(self._format.render(request.messages))
         require_context(len(prompt), request.sampling.max_tokens, self.max_context)
-        job = _Job(prompt, request.sampling, request.seed)
-        await self._batcher.submit(request.tag.episode, request.id, job)
-        completions = tuple(self._completion(s, request.sampling) for s in job.samples)
+        # Greedy samples are all the same, and vLLM refuses to draw several.
+        greedy = request.sampling.temperature == 0
+        job = Job(prompt, replace(request.sampling, n=1) if greedy else request.sampling, request.seed)
+        await self._engine.sample(request.tag.episode, request.id, job)
+        samples = job.samples * request.sampling.n if greedy else job.samples
+        completions = tuple(self._completion(s, request.sampling) for s in samples)
         usage = Usage(len(prompt), sum(len(c.token_ids) for c in completions))
         latency = time.perf_counter() - start
         return LLMCall(request.id, request.tag, prompt, completions, request.sampling, usage, latency, self.name)
-
-    def _run(self, jobs: Sequence[_Job]) -> None:
-        results = self._engine([j.prompt for j in jobs], [j.sampling for j in jobs], [j.seed for j in jobs])
-        for job, samples in zip(jobs, results, strict=True):
-            job.samples = samples
 
     def _completion(self, sample: Sampled, sampling: Sampling) -> Completion:
         """Text cut at the first stop string; the tokens stay as they were sampled."""
@@ -99,10 +108,10 @@ class VLLMBackend:
         return self._format.count_tokens(text)
 
     def enter(self, episode: str) -> None:
-        self._batcher.enter(episode)
+        self._engine.enter(episode)
 
     def leave(self, episode: str) -> None:
-        self._batcher.leave(episode)
+        self._engine.leave(episode)
 
 
 def trl_backend(generation: Any, tokenizer: Any) -> VLLMBackend:
@@ -116,7 +125,7 @@ def trl_backend(generation: Any, tokenizer: Any) -> VLLMBackend:
     """
     if generation.mode == "colocate":
         limit = generation.llm.llm_engine.model_config.max_model_len
-        return VLLMBackend(colocated(generation), tokenizer, max_context=limit)
+        return VLLMBackend(Colocated(generation), tokenizer, max_context=limit)
     client = getattr(generation, "vllm_client", None) or _client(generation)
     model = client.get_server_info()["model_config"]
     if model["logprobs_mode"] != "processed_logprobs":
@@ -124,7 +133,7 @@ def trl_backend(generation: Any, tokenizer: Any) -> VLLMBackend:
             f"the vLLM server runs with --logprobs-mode {model['logprobs_mode']}: its log-probabilities are not those "
             "it samples from; start it with --logprobs-mode processed_logprobs"
         )
-    return VLLMBackend(server(client), tokenizer, max_context=model["max_model_len"])
+    return VLLMBackend(Server(client), tokenizer, max_context=model["max_model_len"])
 
 
 def _client(generation: Any) -> Any:
@@ -135,37 +144,73 @@ def _client(generation: Any) -> Any:
     return VLLMClient(base_url=url, connection_timeout=generation.server_timeout)
 
 
-def colocated(generation: Any) -> Engine:
-    """The engine inside this process (``vllm_mode: colocate``), of TRL's ``VLLMGeneration``."""
+class Colocated:
+    """The engine inside this process (``vllm_mode: colocate``), of TRL's ``VLLMGeneration``.
 
-    def run(
-        prompts: Sequence[Sequence[int]], sampling: Sequence[Sampling], seeds: Sequence[int]
-    ) -> list[list[Sampled]]:
+    Requests join and leave between two of its steps (:mod:`agentspec.llm.batching`, ``eager``).
+    """
+
+    def __init__(self, generation: Any) -> None:
+        self._generation = generation
+        self._batcher: Batcher[Job] = Batcher(self._run, batching="eager")
+        self._names = map("scaffold-{}".format, itertools.count())
+
+    async def sample(self, episode: str, number: int, job: Job) -> None:
+        """See :class:`Engine`."""
+        await self._batcher.submit(episode, number, job)
+
+    def enter(self, episode: str) -> None:
+        """See :class:`Engine`."""
+        self._batcher.enter(episode)
+
+    def leave(self, episode: str) -> None:
+        """See :class:`Engine`."""
+        self._batcher.leave(episode)
+
+    def _run(self, jobs: Sequence[Job]) -> None:
         import torch
-        from vllm import SamplingParams
 
-        device = generation.accelerator.device
+        device = self._generation.accelerator.device
         if device.type == "cuda":
             torch.cuda.set_device(device)  # a property of the thread, and this is not the trainer's
-        parameters = [
-            SamplingParams(
-                n=s.n,
-                temperature=s.temperature,
-                top_p=s.top_p,
-                top_k=s.top_k,
-                max_tokens=s.max_tokens,
-                stop=list(s.stop),
-                include_stop_str_in_output=True,
-                seed=seed % 2**31,
-                logprobs=0,
-            )
-            for s, seed in zip(sampling, seeds, strict=True)
-        ]
-        inputs = [{"prompt_token_ids": list(p)} for p in prompts]
-        outputs = generation.llm.generate(inputs, sampling_params=parameters, use_tqdm=False)
-        return [[_from_output(sample) for sample in output.outputs] for output in outputs]
+        engine = self._generation.llm.llm_engine
+        running: dict[str, Job] = {}
+        joining = jobs
+        try:
+            while joining or running:
+                for job in joining:
+                    name = next(self._names)
+                    running[name] = job
+                    engine.add_request(name, {"prompt_token_ids": list(job.prompt)}, _parameters(job))
+                done = []
+                for output in engine.step():
+                    if output.finished:
+                        job = running.pop(output.request_id)
+                        job.samples = [_from_output(sample) for sample in output.outputs]
+                        done.append(job)
+                joining = self._batcher.exchange(done)
+        finally:
+            if running:
+                engine.abort_request(list(running))
 
-    return run
+
+def _parameters(job: Job) -> Any:
+    from vllm import SamplingParams
+    from vllm.sampling_params import RequestOutputKind
+
+    s = job.sampling
+    return SamplingParams(
+        n=s.n,
+        temperature=s.temperature,
+        top_p=s.top_p,
+        top_k=s.top_k,
+        max_tokens=s.max_tokens,
+        stop=list(s.stop),
+        include_stop_str_in_output=True,
+        seed=job.seed % 2**31,
+        logprobs=0,
+        output_kind=RequestOutputKind.FINAL_ONLY,
+    )
 
 
 def _from_output(sample: Any) -> Sampled:
@@ -174,36 +219,41 @@ def _from_output(sample: Any) -> Sampled:
     return Sampled(ids, logprobs, "length" if sample.finish_reason == "length" else "stop")
 
 
-def server(client: Any) -> Engine:
-    """TRL's vLLM server (``vllm_mode: server``): one request per prompt, all at once, each with its own seed."""
+class Server:
+    """TRL's vLLM server (``vllm_mode: server``): one request per prompt, as episodes ask, each with its own seed."""
 
-    def ask(prompt: Sequence[int], sampling: Sampling, seed: int) -> list[Sampled]:
-        output = client.generate(
-            [list(prompt)],
-            n=sampling.n,
-            temperature=sampling.temperature,
-            top_p=sampling.top_p,
-            top_k=sampling.top_k,
-            max_tokens=sampling.max_tokens,
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._threads = ThreadPoolExecutor(REQUESTS, thread_name_prefix="agentspec-vllm")
+
+    async def sample(self, episode: str, number: int, job: Job) -> None:
+        """See :class:`Engine`."""
+        await asyncio.get_running_loop().run_in_executor(self._threads, self._ask, job)
+
+    def enter(self, episode: str) -> None:
+        """The server need not know."""
+
+    def leave(self, episode: str) -> None:
+        """The server need not know."""
+
+    def _ask(self, job: Job) -> None:
+        s = job.sampling
+        output = self._client.generate(
+            [list(job.prompt)],
+            n=s.n,
+            temperature=s.temperature,
+            top_p=s.top_p,
+            top_k=s.top_k,
+            max_tokens=s.max_tokens,
             logprobs=0,
             generation_kwargs={
-                "stop": list(sampling.stop),
+                "stop": list(s.stop),
                 "include_stop_str_in_output": True,
-                "seed": seed % 2**31,
+                "seed": job.seed % 2**31,
             },
         )
-        samples = []
         parts = (output[name] for name in ("completion_ids", "logprob_token_ids", "logprobs"))
         for ids, tokens, logprobs in zip(*parts, strict=True):
             own = (v[t.index(i)] for i, t, v in zip(ids, tokens, logprobs, strict=True))
-            reason = "length" if len(ids) >= sampling.max_tokens else "stop"
-            samples.append(Sampled(tuple(ids), tuple(map(float, own)), reason))
-        return samples
-
-    def run(
-        prompts: Sequence[Sequence[int]], sampling: Sequence[Sampling], seeds: Sequence[int]
-    ) -> list[list[Sampled]]:
-        with ThreadPoolExecutor(min(len(prompts), REQUESTS)) as pool:
-            return list(pool.map(ask, prompts, sampling, seeds))
-
-    return run
+            reason = "length" if len(ids) >= s.max_tokens else "stop"
+            job.samples.append(Sampled(tuple(ids), tuple(map(float, own)), reason))

@@ -37,7 +37,10 @@ class FakeVLLM:
         self.llm_engine = SimpleNamespace(
             model_config=SimpleNamespace(max_model_len=4096),
             model_executor=SimpleNamespace(driver_worker=inner),
+            add_request=self.add_request,
+            step=self.step,
         )
+        self._asked: list[tuple[str, Any, Any]] = []
 
     def _forget(self) -> None:
         for parameter in self.model.parameters():
@@ -61,11 +64,16 @@ class FakeVLLM:
             assert known[name].shape == weight.shape, name
             known[name].copy_(weight.detach())
 
-    def generate(self, inputs: Any, *, sampling_params: Any, use_tqdm: bool) -> list[Any]:
+    def add_request(self, name: str, prompt: Any, parameters: Any) -> None:
+        self._asked.append((name, prompt["prompt_token_ids"], parameters))
+
+    def step(self) -> list[Any]:
+        """Answers everything at once."""
         assert self.awake == {"weights", "kv_cache"}
+        asked, self._asked = self._asked, []
         return [
-            SimpleNamespace(outputs=[self._sample(i["prompt_token_ids"], p, n) for n in range(p.n)])
-            for i, p in zip(inputs, sampling_params, strict=True)
+            SimpleNamespace(request_id=name, finished=True, outputs=[self._sample(ids, p, n) for n in range(p.n)])
+            for name, ids, p in asked
         ]
 
     @torch.no_grad()
@@ -97,7 +105,10 @@ def use_fake_vllm(monkeypatch: pytest.MonkeyPatch, stop: int, bias: float = 0.0)
     module = ModuleType("vllm")
     module.__spec__ = ModuleSpec("vllm", None)
     module.SamplingParams = lambda **fields: SimpleNamespace(**fields)  # type: ignore[attr-defined]
+    sampling = ModuleType("vllm.sampling_params")
+    sampling.RequestOutputKind = SimpleNamespace(FINAL_ONLY="final")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "vllm", module)
+    monkeypatch.setitem(sys.modules, "vllm.sampling_params", sampling)
     monkeypatch.setattr(VLLMGeneration, "_init_vllm", start)
     monkeypatch.setattr("trl.generation.vllm_generation.empty_cache", lambda: None)
 

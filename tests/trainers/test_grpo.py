@@ -257,3 +257,9 @@ def test_padded_forwards_equal_row_by_row_ones() -> None:
 def test_what_cannot_work_is_refused_at_start(tmp_path: Any, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecError, match=message.replace("{", r"\{")):
         ScaffoldConfig(**settings(tmp_path, **changes)).check()
+
+
+def test_a_cpu_computes_in_float32_unless_it_is_told_otherwise(tmp_path: Any) -> None:
+    unsaid = {k: v for k, v in settings(tmp_path).items() if k != "bf16"}
+    assert ScaffoldConfig(**unsaid).bf16 is False
+    assert ScaffoldConfig(**unsaid, bf16=True).bf16 is True
