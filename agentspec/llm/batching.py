@@ -186,8 +186,8 @@ class Batcher(Generic[T]):
             out = batch.episodes - self._episodes(batch)
             ordered = rest > _NEARLY_DONE and out >= max(1, _SHARE * batch.episodes)
             due = self.batching == "eager" or ordered
-            enough = partial(self._may_join, batch, due and delivered)
-            patient = await self._wait(enough)
+            worth_it = due and delivered
+            patient = await self._wait(lambda: self._batch is not batch or not worth_it or self._complete())
             # A batch of strangers alone, who wait for nobody, must not keep the live episodes out.
             everybody = due or not patient or (not batch.episodes and self._complete())
             if self._batch is batch:
@@ -267,7 +267,8 @@ class Batcher(Generic[T]):
                 self._settle(p, error)
 
     def _settle(self, pending: _Pending[T], error: BaseException | None) -> None:
-        self._pace.answered(pending.episode)
+        if pending.episode in self._live:
+            self._pace.answered(pending.episode)
         _settle(pending.done, error)
 
     def _work(self, batch: _Batch[T]) -> None:
@@ -302,9 +303,6 @@ class Batcher(Generic[T]):
         """Every live episode waits on the model."""
         jobs = self._batch.jobs if self._batch else []
         return self._live.keys() <= {p.episode for p in [*self._pending, *jobs]}
-
-    def _may_join(self, batch: _Batch[T], worth_waiting: bool) -> bool:
-        return self._batch is not batch or not worth_waiting or self._complete()
 
     def _may_start(self) -> bool:
         """Nothing is gained by waiting (also: nothing is left to run)."""

@@ -11,6 +11,19 @@ from typing import Any
 import pytest
 
 from agentspec.llm.batching import Batcher, Batching
+from agentspec.llm.pace import Pace
+
+
+class FixedPace(Pace):
+    """Waits for a given time."""
+
+    def __init__(self, grace_s: float) -> None:
+        super().__init__()
+        self._grace_s = grace_s
+
+    @property
+    def grace_s(self) -> float:
+        return self._grace_s
 
 
 class Steps:
@@ -150,6 +163,50 @@ def test_eager_waits_for_nobody() -> None:
     run(main())
     assert machine.steps[0] == "a0 c0"
     assert {"a1 c0", "a2 c0"} <= set(machine.steps)
+
+
+@pytest.mark.parametrize("grace_s", [0.0, 10.0])
+def test_eager_waits_as_long_as_those_who_act_are_worth_it(grace_s: float) -> None:
+    machine = Steps("eager")
+    machine.batcher._pace = FixedPace(grace_s)
+    episodes = {"a": [1, 1], "b": [1, 1], "c": [40]}
+
+    async def main() -> None:
+        pauses = {"a": 0.01, "b": 0.02, "c": 0.0}
+        await asyncio.gather(*[play(machine.batcher, e, n, pauses[e]) for e, n in episodes.items()])
+
+    run(main())
+    together = ["a0 b0 c0", "a1 b1 c0", *["c0"] * 38]
+    assert (machine.steps == together) == bool(grace_s)
+    # Without, the others have long gone on when the first is back.
+    assert machine.steps[0] == "a0 b0 c0" and (bool(grace_s) or machine.steps[1] == "c0")
+
+
+def test_waiting_pays_for_those_who_are_back_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("agentspec.llm.pace.time.perf_counter", lambda: clock[0])
+    pace = Pace()
+
+    def away(episode: str, seconds: float) -> None:
+        pace.answered(episode)
+        clock[0] += seconds
+        pace.asked(episode)
+
+    for _ in range(50):
+        pace.worked(0.1)
+        away("a", 0.04)
+    assert (pace.step_s, pace.away_s) == (pytest.approx(0.1, rel=1e-4), pytest.approx(0.04, rel=1e-4))
+    assert pace.grace_s == pytest.approx(0.05, rel=1e-4)  # half a step
+    for _ in range(50):
+        away("b", 0.06)
+    assert pace.grace_s == 0.0
+    # What never comes back, or was never answered, is not counted.
+    pace.answered("c")
+    pace.ended("c")
+    clock[0] += 1000
+    pace.asked("c")
+    pace.asked("d")
+    assert pace.away_s == pytest.approx(0.06, rel=1e-3)
 
 
 def test_patience_ends_in_a_running_batch_too() -> None:
