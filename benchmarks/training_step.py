@@ -1,6 +1,6 @@
 """One update on the same rows: prefix-tree packing beside stock TRL's padded rows.
 
-    python -m benchmarks.training_step [--json] [--rollouts 8] [--turns 8] [--repeats 3]
+    python -m benchmarks.training_step [--json] [--rollouts 4] [--turns 8] [--repeats 3]
 
 Rows have the shape of real episodes in three layouts (token counts of the quick-start: a static prompt, then an
 observation and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one
@@ -25,7 +25,8 @@ from typing import Any
 
 import torch
 
-LAYOUTS = ("conversation", "snapshot", "supo")
+LAYOUTS = {"conversation": 8, "snapshot": 8, "supo": 16}
+"""Layout -> turns of an episode: SUPO's are long enough for two segments."""
 STATIC, OBSERVATION, ANSWER, SUMMARY, SEGMENT = 300, 120, 8, 60, 8
 
 
@@ -219,7 +220,7 @@ def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) 
     from trainers.tree import build_tree
 
     vocabulary = int(ours.model.get_input_embeddings().weight.shape[0])
-    rows = make_rows(layout, options.rollouts, options.turns, vocabulary)
+    rows = make_rows(layout, options.rollouts, options.turns or LAYOUTS[layout], vocabulary)
     theirs, mine = stock_update(stock, rows, options.micro), our_update(ours, rows, options.ours_micro)
     times: dict[str, list[float]] = {"trl": [], "ours": []}
     memory: dict[str, list[float]] = {"trl": [], "ours": []}
@@ -262,8 +263,8 @@ def main() -> None:
     """Run all layouts and print a table, or JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--model", default="smollm2-135m")
-    parser.add_argument("--rollouts", type=int, default=8)
-    parser.add_argument("--turns", type=int, default=12)
+    parser.add_argument("--rollouts", type=int, default=4, help="8 and 12 turns take stock TRL more than 24 GB")
+    parser.add_argument("--turns", type=int, help="of every layout (default: 8, supo 16)")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--micro", type=int, default=4, help="rows per micro-batch of stock TRL")
     parser.add_argument("--ours-micro", type=int, default=2, help="micro-batches of our update")
