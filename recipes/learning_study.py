@@ -74,12 +74,12 @@ def train(path: str, seed: int, folder: Path) -> None:
 
 def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], out: Path) -> None:
     """Play the matrix and write tables and curves."""
+    from agentspec.llm.models import resolve_adapter
     from agentspec.state import write_atomic
     from eval.matrix import Policy, evaluate
     from eval.plots import learning_curves
     from eval.tables import write_report
     from trainers.config import agent_spec
-    from trainers.policy import resolve_adapter
     from trainers.rollouts import make_tasks
     from trainers.runlog import RunLog
 

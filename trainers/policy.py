@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from agentspec.llm.base import LLMError
+from agentspec.llm.models import resolve_adapter
 from agentspec.registry import SpecError
 from trainers.config import ScaffoldConfig
 
@@ -146,21 +147,3 @@ def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
     head = wrapper.get_output_embeddings()
     named = model.named_modules()
     return sorted({n.rpartition(".")[2] for n, m in named if isinstance(m, nn.Linear) and m is not head})
-
-
-def resolve_adapter(name: str) -> str:
-    """A PEFT adapter: a folder, the name of one that ships with ``trainers``, or a hub id (``owner/name``).
-
-    Raises:
-        LLMError: none of these.
-    """
-    shipped = Path(__file__).parent / "adapters"
-    bundled = shipped / name
-    if (bundled / "adapter_config.json").is_file():
-        return str(bundled)
-    if (Path(name) / "adapter_config.json").is_file() or (name.count("/") == 1 and not Path(name).exists()):
-        return name
-    names = sorted(p.parent.name for p in shipped.glob("*/adapter_config.json"))
-    raise LLMError(
-        f"adapter {name!r} is no folder with an adapter_config.json, and none that ships ({', '.join(names) or 'none'})"
-    )

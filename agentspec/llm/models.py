@@ -6,6 +6,8 @@ A name is looked up in this order:
 2. a bundled alias (:data:`BUNDLED`): weights that come with an installed Python package, converted once to an ordinary
    Hugging Face folder in the cache directory (``AGENTSPEC_CACHE``, else ``~/.cache/agentspec``);
 3. a Hugging Face hub id, from the hub's own cache or the network.
+
+Adapters likewise (:func:`resolve_adapter`): a folder, the name of one that ships, a hub id.
 """
 
 from __future__ import annotations
@@ -89,7 +91,7 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     """
     name = os.fspath(name)
     if adapter is not None:
-        return replace(resolve(name), adapter=_adapter(Path(adapter).expanduser()))
+        return replace(resolve(name), adapter=resolve_adapter(adapter))
     folder = Path(name).expanduser()
     if (folder / "config.json").is_file():
         return ModelSource(str(folder), folder.resolve().name)
@@ -111,13 +113,34 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     return _hub(name)
 
 
-def _adapter(folder: Path) -> str:
-    if not (folder / "adapter_config.json").is_file():
-        raise ModelNotFoundError(
-            f"{folder} is no PEFT adapter: there is no adapter_config.json in it; give a folder written by "
-            "`PeftModel.save_pretrained`"
-        )
-    return str(folder)
+def resolve_adapter(name: str | os.PathLike[str]) -> str:
+    """A PEFT adapter: an existing folder, the name of one that ships with ``trainers``, or a hub id (``owner/name``).
+
+    Raises:
+        ModelNotFoundError: none of these.
+    """
+    name = os.fspath(name)
+    folder = Path(name).expanduser()
+    if (folder / "adapter_config.json").is_file():
+        return str(folder)
+    shipped = _shipped_adapters()
+    if name in shipped:
+        return str(shipped[name])
+    tried = f"{name} is no PEFT adapter: there is no adapter_config.json in it"
+    remedy = (
+        "give a folder written by `PeftModel.save_pretrained`, a hub id with network access, or one that ships: "
+        f"{', '.join(sorted(shipped)) or 'none here'}"
+    )
+    if folder.exists() or not _HUB_ID.fullmatch(name):
+        raise ModelNotFoundError(f"{tried}; {remedy}")
+    _ask_hub(name, "adapter_config.json", tried, remedy)
+    return name
+
+
+def _shipped_adapters() -> dict[str, Path]:
+    found = importlib.util.find_spec("trainers")
+    folders = [Path(place) / "adapters" for place in (found.submodule_search_locations or ())] if found else []
+    return {p.parent.name: p.parent for folder in folders for p in folder.glob("*/adapter_config.json")}
 
 
 def _hub(name: str) -> ModelSource:
@@ -130,16 +153,21 @@ def _hub(name: str) -> ModelSource:
     )
     if not _HUB_ID.fullmatch(name):
         raise ModelNotFoundError(f"{tried}, and it is no hub id (owner/name); {remedy}")
+    _ask_hub(name, "config.json", tried, remedy)
+    return ModelSource(name, name)
+
+
+def _ask_hub(name: str, file: str, tried: str, remedy: str) -> None:
+    """Raise :class:`ModelNotFoundError` unless the hub, or its cache here, has ``name``."""
     from huggingface_hub import HfApi, try_to_load_from_cache
 
-    if isinstance(try_to_load_from_cache(name, "config.json"), str):
-        return ModelSource(name, name)
+    if isinstance(try_to_load_from_cache(name, file), str):
+        return
     try:
         HfApi().model_info(name, timeout=_HUB_TIMEOUT_S)
     except Exception as error:  # offline, not found, gated: the hub has many ways to say no
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ModelNotFoundError(f"{tried}, and the hub did not give it ({reason}); {remedy}") from error
-    return ModelSource(name, name)
 
 
 def _bundled(alias: str) -> ModelSource:

@@ -10,7 +10,7 @@ import pytest
 
 from agentspec.llm import build_llm, models
 from agentspec.llm.base import LLMError
-from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
+from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve, resolve_adapter
 from agentspec.llm.scripted import ScriptedLLM
 from tests.llm.helpers import needs_smollm2
 
@@ -39,11 +39,23 @@ def test_adapter_given_or_named(tmp_path):
     expected = ModelSource(str(base), "base", str(adapter))
     assert resolve(base, adapter) == expected
     assert resolve(adapter) == expected
-    with pytest.raises(ModelNotFoundError, match="no PEFT adapter"):
-        resolve(base, base)
+    for name in (base, "no-such-adapter", "nobody/no-such-adapter"):
+        with pytest.raises(ModelNotFoundError, match=r"no PEFT adapter.*that ships: .*smollm2-135m-courier"):
+            resolve(base, name)
     orphan = folder(tmp_path / "orphan", "adapter_config.json")
     with pytest.raises(ModelNotFoundError, match="which model it belongs to"):
         resolve(orphan)
+
+
+def test_an_adapter_that_ships_is_found_by_name(tmp_path, monkeypatch):
+    base = folder(tmp_path / "base", "config.json")
+    shipped = Path(resolve_adapter("smollm2-135m-courier"))
+    assert (shipped / "adapter_model.safetensors").is_file()
+    assert resolve(base, "smollm2-135m-courier").adapter == str(shipped)
+    # A folder of that name comes first, as for models.
+    monkeypatch.chdir(tmp_path)
+    folder(tmp_path / "smollm2-135m-courier", "adapter_config.json")
+    assert resolve_adapter("smollm2-135m-courier") == "smollm2-135m-courier"
 
 
 def test_missing_models_say_what_was_tried_and_what_to_do(tmp_path):
