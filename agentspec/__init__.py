@@ -5,5 +5,5 @@ import os
 __version__ = "0.1.0"
 
 # MKL, read when it first multiplies: the same row times the same matrix gives the same bits, however many other rows
-# there are. Costs nothing that we could measure; without it what is sampled depends on who else is in the batch.
+# there are. Without it what is sampled depends, by rounding, on who else is in the batch.
 os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
