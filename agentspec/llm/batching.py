@@ -16,9 +16,9 @@ the others write, and takes new requests in between two steps of the work:
   longer than a step of the model, ``closed`` is faster.
 - ``eager`` takes in whoever asks, and waits for nobody, or for a moment where episodes usually come back within one
   (:mod:`agentspec.llm.pace`): the fastest, most of all with slow environments. Who is in the batch depends on timing.
-  Where arithmetic is batch-invariant (:meth:`~agentspec.llm.local_forward.PackedModel.invariant`) nothing else does, and
-  a run can be repeated to the last bit all the same; elsewhere the batch's rounding makes a rerun differ in the last
-  bits and, now and then, in a token.
+  Where arithmetic is batch-invariant (:meth:`~agentspec.llm.local_forward.PackedModel.invariant`) nothing else does,
+  and a run can be repeated to the last bit all the same; elsewhere the batch's rounding makes a rerun differ in the
+  last bits and, now and then, in a token.
 
 An episode leaves when it ends; one that fails or is cancelled without saying so leaves when the task that entered it
 ends. Requests without an episode, or from an episode that never entered, wait for nobody. As a last resort, for
