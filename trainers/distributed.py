@@ -55,6 +55,12 @@ def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:
         )
 
 
+def is_sharded(accelerator: Any) -> bool:
+    """Whether weights are sharded over processes (FSDP, ZeRO-3)."""
+    layout = DistributedBackend(accelerator)
+    return bool(layout.is_fsdp or layout.is_zero3)
+
+
 def keep_precision(accelerator: Any) -> None:
     """Let FSDP compute in its low precision, but not round what goes into a forward and comes out of it.
 

@@ -24,7 +24,7 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.registry import SpecError
 from agentspec.state import write_atomic
-from trainers.batches import ROWS
+from trainers.micro_batches import ROWS
 from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:

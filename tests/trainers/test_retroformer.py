@@ -15,6 +15,7 @@ pytest.importorskip("peft")
 
 from datasets import Dataset
 from peft import LoraConfig, get_peft_model
+from trainers.batches import rows_logprobs
 
 from agentspec.episode import Job
 from agentspec.reflection.retroformer import PATH, reflection_samples
@@ -27,7 +28,6 @@ from tests.trainers.builders import CPU_RUN, call, episode
 from tests.trainers.played import toy_tasks
 from tests.trainers.test_resume import _stop_after
 from trainers.audit import audit
-from trainers.batches import rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
 from trainers.policy import ACTOR, TRAINED, load_actor_and_reflector, load_policy
