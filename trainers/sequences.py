@@ -121,11 +121,13 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
     """The training rows of one episode, each with at least one trained token.
 
     A call extends the longest sequence that its prompt contains as a prefix. Two completions of one prompt never share
-    a row: the second starts its own.
+    a row: the second starts its own. Calls of helper models (the spec's `roles`) are never trained.
     """
     train = train or TrainFilter()
     rows: list[TokenSequence] = []
     for call in trajectory.calls:
+        if any(fnmatchcase(call.tag.module, helped) for helped in trajectory.spec.get("roles", {})):
+            continue
         for index in train.completions(call):
             row = _extendable(rows, call.prompt_ids)
             if row is None:
