@@ -140,7 +140,8 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
 
     A call extends the longest sequence that its prompt contains as a prefix. Two completions of one prompt never share
     a row: the second starts its own. A call made after the last step (`tag.step` is the number of transitions, a
-    memory that stores the last one, say) earns nothing in this episode and is left out.
+    memory that stores the last one, say) earns nothing in this episode and is left out; calls of
+    helper models (the spec's `roles`) are never trained.
     """
     rows: list[TokenSequence] = []
     for call, completion in trained_completions(trajectory, train or TrainFilter()):
@@ -155,8 +156,9 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
 
 def trained_completions(trajectory: Trajectory, train: TrainFilter) -> list[tuple[LLMCall, Completion]]:
     """The completions of an episode that are trained, each with its call, in the order they were made."""
-    steps = len(trajectory.transitions)
-    return [(call, c) for call in trajectory.calls if call.tag.step < steps for c in train.completions(call)]
+    roles = trajectory.spec.get("roles", {})
+    own = [call for call in trajectory.calls if not any(fnmatchcase(call.tag.module, role) for role in roles)]
+    return [(call, c) for call in own if call.tag.step < len(trajectory.transitions) for c in train.completions(call)]
 
 
 def _extendable(rows: list[TokenSequence], prompt: SequenceOf[int]) -> TokenSequence | None:
