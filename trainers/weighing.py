@@ -16,7 +16,8 @@ from agentspec.trajectory import Trajectory
 from rewards import RewardSet
 from trainers.advantages import ESTIMATORS, zero_variance
 from trainers.batches import Row
-from trainers.config import STEP_ESTIMATORS, ScaffoldConfig
+from trainers.checks import STEP_ESTIMATORS
+from trainers.config import ScaffoldConfig
 from trainers.sequences import TokenSequence, build_sequences
 from trainers.step_advantages import gigpo, reward_to_go
 

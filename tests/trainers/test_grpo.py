@@ -66,7 +66,7 @@ def settings(tmp_path: Any, **changes: Any) -> dict[str, Any]:
         "save_strategy": "no",
         "logging_steps": 1,
         "disable_tqdm": True,
-        "max_completion_length": 40,
+        **({"max_completion_length": 40} if changes.get("loss_type") == "dr_grpo" else {}),
         "shuffle_dataset": False,
         **changes,
     }

@@ -17,11 +17,12 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from recipes.common import CONFIGS, parse_config
+from recipes.common import CONFIGS
 from rewards import RewardSet
 from tests.toy_env import TOY
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_trainer
+from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.runlog import RunLog
@@ -72,7 +73,7 @@ def test_what_is_not_supo_is_refused(tmp_path: Path, agent: dict[str, Any], mess
 
 
 def test_the_recipe_s_configuration_is_supo() -> None:
-    config = parse_config(["--config", str(CONFIGS / "supo_cpu.yaml")])
+    config = parse_config([], default=CONFIGS / "supo_cpu.yaml")
     config.check()
     before = (config.spec.to_data(), list(config.train_calls), list(config.mask_truncated))
     as_supo(config)
