@@ -2,7 +2,7 @@
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
 
-The adapter in ``trainers/adapters/smollm2-135m-courier`` was made with this command. TRL's ``SFTTrainer`` trains on
+The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's ``SFTTrainer`` trains on
 the tokens the expert chose; prompts and observations are context.
 """
 
