@@ -55,11 +55,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Credited:
-    """Rows of this rank with their advantages, what the logs say about them, and the (mean) advantage per episode."""
+    """Rows of this rank with their advantages, and what the logs say about them."""
 
     rows: list[Row]
     metrics: dict[str, float]
-    advantages: list[float]
 
 
 @dataclass(frozen=True)
@@ -179,8 +178,7 @@ class CreditRule:
             rows += [Row(s, _per_token(s, advantage), i) for s in sequences]
         if self.normalize == "rollout":
             rows = per_rollout(rows, gather)
-        mine = [_mean(a) for a in advantages[first : first + len(episodes)]]
-        return Credited(rows, _metrics(outcomes, signal, rows, len(episodes)), mine)
+        return Credited(rows, _metrics(outcomes, signal, rows, len(episodes)))
 
     def signal(self, advantages: Sequence[float | list[float] | None]) -> list[bool]:
         """Per group whether its estimator gives anyone an advantage other than 0."""
@@ -235,10 +233,6 @@ def _total(rewards: Sequence[float]) -> float:
 
 def _times(advantage: Advantage, factor: float) -> Advantage:
     return advantage * factor if isinstance(advantage, float) else tuple(a * factor for a in advantage)
-
-
-def _mean(advantage: float | list[float] | None) -> float:
-    return sum(advantage) / max(1, len(advantage)) if isinstance(advantage, list) else advantage or 0.0
 
 
 def _nonzero(advantage: float | list[float] | None) -> bool:

@@ -35,7 +35,7 @@ from trainers.micro_batches import ROWS, collate, padding_row, partition
 from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
 from trainers.rollouts import collect, rollout_jobs, task_of
 from trainers.round_metrics import episode_metrics, round_metrics
-from trainers.runlog import RunLog, transcript
+from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
@@ -291,6 +291,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         per_token = per_token * inputs.get("importance_sampling_ratio", 1.0)
         if self.beta != 0.0:
             figures["kl"] = divergence(logps, inputs["ref_per_token_logps"])
+            if self.args.use_bias_correction_kl:
+                figures["kl"] = figures["kl"] * (logps - old).exp()
             per_token = per_token + self.beta * figures["kl"]
         for name, values in figures.items():
             sums = torch.stack([(values.detach() * mask).sum(), mask.sum().float()])
@@ -333,23 +335,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         figures |= credited.metrics | episode_metrics(episodes) | truncated_calls(episodes, rule.train)
         for name, value in figures.items():
             self._metrics["train"][name].append(value)
-        self._log_completions(credited)
         self.run_log.trajectories(self._round, self.accelerator.process_index, episodes)
-
-    def _log_completions(self, credited: Credited) -> None:
-        """TRL's table of prompts and completions (`log_completions`)."""
-        if not self.log_completions:
-            return
-        own = [
-            (f"{e.trajectory.task.env} seed {e.trajectory.task.seed}", transcript(e.trajectory), e.score, a)
-            for e, a in zip(self._played, credited.advantages, strict=True)
-        ]
-        for prompt, completion, score, advantage in gather_object(own):
-            self._logs["prompt"].append([{"role": "user", "content": prompt}])
-            self._logs["completion"].append([{"role": "assistant", "content": completion}])
-            self._logs["advantages"].append(advantage)
-            for name in self.rewards_used.weights:
-                self._logs["rewards"][name].append(None if score is None else score.sums[name])
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
@@ -419,7 +405,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
 
 
 def named(reward: str) -> Callable[..., Any]:
-    """A reward function as TRL wants one: its name stands in the logs. Episodes are scored before credit, not by TRL."""
+    """A reward function as TRL wants one, by name only: episodes are scored before credit, not by TRL."""
 
     def score(**_: Any) -> Any:
         raise NotImplementedError("episodes are scored once, as they are played")

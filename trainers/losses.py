@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -171,22 +170,6 @@ def loss(name: str) -> LossSpec:
     if name not in LOSSES:
         raise SpecError(f"unknown loss_type {name!r}{suggest(name, LOSSES)}")
     return LOSSES[name]
-
-
-def check_loss(config: Any) -> None:
-    """Refuse a loss that is not offered, and settings that change nothing under the one that is.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
-    spec = loss(config.loss_type)
-    if config.delta is not None and "delta" not in spec.uses:
-        raise SpecError(f"delta {config.delta} changes nothing with loss_type {spec.name!r}; leave it out")
-    if config.normalize == "rollout" and not spec.per_token:
-        raise SpecError(
-            f"normalize 'rollout' with loss_type {spec.name!r}: its denominator is not the number of trained tokens; "
-            f"use one of {', '.join(name for name, s in LOSSES.items() if s.per_token)}"
-        )
 
 
 def divergence(logps: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:

@@ -9,6 +9,7 @@ scaffold.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 
@@ -47,7 +48,7 @@ def partition(
     if by_prefix:
         ordered = sorted(rows, key=lambda r: r.sequence.tokens)
         bounds = [i * len(rows) // count for i in range(count + 1)]
-        parts = [ordered[start:stop] for start, stop in zip(bounds, bounds[1:], strict=False)]
+        parts = [ordered[start:stop] for start, stop in pairwise(bounds)]
     else:
         tokens = [0] * count
         for row in sorted(rows, key=lambda r: -len(r.sequence)):

@@ -1,7 +1,7 @@
 """What is logged of a generation round, under TRL's names where TRL has one.
 
-A *completion*, where TRL speaks of one, is everything that the policy chose in an episode: the trained tokens of all its
-calls. Figures are over the episodes of all ranks.
+A *completion*, where TRL speaks of one, is everything that the policy chose in an episode: the trained tokens of all
+its calls. Figures are over the episodes of all ranks.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def round_metrics(
 def reward_metrics(
     terms: Sequence[Mapping[str, float] | None], weights: Mapping[str, float], group: int
 ) -> dict[str, float]:
-    """`rewards/NAME/mean`, `rewards/NAME/std`, `reward`, `reward_std` and `frac_reward_zero_std`, as TRL computes them."""
+    """`rewards/NAME/mean` and `/std`, `reward`, `reward_std` and `frac_reward_zero_std`, as TRL computes them."""
     values = torch.tensor([[math.nan if t is None else t[name] for name in weights] for t in terms])
     metrics: dict[str, float] = {}
     for i, name in enumerate(weights):

@@ -12,9 +12,9 @@ pytest.importorskip("trl")
 
 from tests.trainers.builders import call, episode
 from tests.trainers.test_resume import trainer
-from trainers.batches import collate
 from trainers.call_metrics import CallMetrics, clipped_tokens
 from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.micro_batches import collate
 from trainers.runlog import RunLog
 from trainers.sequences import Row, TrainFilter, build_sequences
 

@@ -23,8 +23,8 @@ from rewards import RewardSet
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
 from tests.trainers.test_supo import configured, credited, played
-from trainers.batches import blank_row, collate, deal
-from trainers.config import EXACT_LOSSES, ROW_LOSSES
+from trainers.checks import EXACT_LOSSES, ROW_LOSSES, notes
+from trainers.micro_batches import collate
 from trainers.runlog import RunLog
 from trainers.sequences import Row, TokenSequence
 
@@ -128,9 +128,9 @@ def test_nothing_to_learn_is_no_nan(tmp_path: Path) -> None:
 
 def test_losses_that_weigh_rows_are_named_or_refused(tmp_path: Path) -> None:
     for loss_type in EXACT_LOSSES:
-        assert configured(tmp_path, loss_type=loss_type).warnings() == []
+        assert notes(configured(tmp_path, loss_type=loss_type)) == []
     for loss_type in ROW_LOSSES:
-        (note,) = configured(tmp_path, loss_type=loss_type).warnings()
+        (note,) = notes(configured(tmp_path, loss_type=loss_type))
         assert loss_type in note and "'dapo' does not depend on rows" in note
     # GSPO's ratio is of a row, not of a rollout.
     with pytest.raises(SpecError, match="speaks of rows"):

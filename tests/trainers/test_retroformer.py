@@ -15,7 +15,6 @@ pytest.importorskip("peft")
 
 from datasets import Dataset
 from peft import LoraConfig, get_peft_model
-from trainers.batches import rows_logprobs
 
 from agentspec.episode import Job
 from agentspec.reflection.retroformer import PATH, reflection_samples
@@ -30,6 +29,7 @@ from tests.trainers.test_resume import _stop_after
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
+from trainers.forward import rows_logprobs
 from trainers.policy import ACTOR, TRAINED, load_actor_and_reflector, load_policy
 from trainers.retroformer import RetroformerTrainer, as_retroformer, play_trials
 from trainers.rollouts import task_rows
