@@ -179,7 +179,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""
-        check_trained(self.last_episodes, self.args, gather_object)
+        check_trained(self.last_episodes, self.credit_rule.train, gather_object)
 
     def _carried_memory(self) -> bytes | None:
         """With ``scope: run``: the memory that the next round starts from, the same on every rank."""
