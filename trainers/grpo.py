@@ -66,7 +66,6 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, PolicyLoss, GRPOTrainer):
         self.rewards_used = args.reward_set
         self.credit_rule = CreditRule.from_config(args)
         self._played: list[ScoredEpisode] = []
-        self._current: dict[str, Any] | None = None
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
         super().__init__(

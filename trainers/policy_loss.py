@@ -30,6 +30,8 @@ else:
 class PolicyLoss(Base):
     """Computes the loss of a micro-batch as of :func:`~trainers.micro_batches.collate`; see the module's docstring."""
 
+    _current: dict[str, Any] | None = None
+
     @property
     def _steps_per_round(self) -> int:
         """Micro-batches between two generation rounds."""
@@ -73,7 +75,7 @@ class PolicyLoss(Base):
         """As TRL computes its losses, with an objective of :mod:`trainers.losses`."""
         logps, entropies, _ = self._get_per_token_logps_and_entropies(model)
         mask, old = inputs["tool_mask"], inputs.get("old_per_token_logps", logps.detach())
-        per_token = self.loss_spec.objective(logps, old, per_token_advantages(inputs), **self._limits)  # type: ignore[misc]
+        per_token = self.loss_spec.objective(logps, old, per_token_advantages(inputs), **self._limits)
         clipped = self.loss_spec.clipped(logps.detach(), old, per_token_advantages(inputs), **self._limits)
         figures = {"entropy": entropies, "clip_ratio/region_mean": clipped.float()}
         if self.top_entropy_quantile < 1.0:
