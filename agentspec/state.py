@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from pathlib import Path
 from typing import Any
+
+from agentspec.files import write_atomic
+
+__all__ = ["dump_state", "load_state", "write_atomic"]
 
 
 def dump_state(data: Any) -> bytes:
@@ -17,21 +18,3 @@ def dump_state(data: Any) -> bytes:
 def load_state(blob: bytes) -> Any:
     """What :func:`dump_state` wrote."""
     return json.loads(blob.decode())
-
-
-def write_atomic(path: str | Path, data: str | bytes) -> None:
-    """Write a file so that it is either whole or absent, never half written (temporary file, then rename)."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    blob = data.encode() if isinstance(data, str) else data
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(blob)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

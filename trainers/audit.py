@@ -137,7 +137,7 @@ def _config(data: dict[str, Any]) -> Any:
 def _audit_update(folder: Path, record: dict[str, Any], config: Any) -> Receipt:
     from trainers.weighing import weigh
 
-    receipt = Receipt(record["round"], denominator=record["denominator"], blank_rows=record["blank_rows"])
+    receipt = Receipt(record["round"], denominator=record["denominator"], blank_rows=record["padding_rows"])
     files = sorted((folder / "trajectories").glob(f"{record['round']:06d}*.jsonl"))
     if not files:
         receipt.violations.append(f"the episodes of this update are missing ({folder}/trajectories)")

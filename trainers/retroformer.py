@@ -30,7 +30,7 @@ from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
-from agentspec.trajectory import Trajectory, write_trajectories
+from agentspec.trajectory import Trajectory
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
@@ -153,8 +153,7 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         ):
             if values:
                 self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
-        name = f"{self._round:06d}.rank{self.accelerator.process_index}.jsonl"
-        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, self._first_trials)
+        self.run_log.trajectories(self._round, self.accelerator.process_index, self._first_trials, FIRST_TRIALS)
 
 
 def play_trials(

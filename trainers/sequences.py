@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 
+from agentspec.tags import matches
 from agentspec.trajectory import Trajectory
 from agentspec.types import Credit, LLMCall
 
@@ -36,22 +36,18 @@ class TrainFilter:
 
     def matches(self, path: str) -> bool:
         """Whether calls of ``path`` may be trained."""
-        return _matches(path, self.patterns)
+        return matches(path, self.patterns)
 
     def completions(self, call: LLMCall) -> list[int]:
         """Indices of the trained completions of ``call``."""
         if not self.matches(call.tag.path):
             return []
-        cut = _matches(call.tag.path, self.mask_truncated)
+        cut = matches(call.tag.path, self.mask_truncated)
         return [
             i
             for i, c in enumerate(call.completions)
             if c.credit in self.credits and c.token_ids and not (cut and c.finish_reason == "length")
         ]
-
-
-def _matches(path: str, patterns: SequenceOf[str]) -> bool:
-    return any(fnmatchcase(path, p if "/" in p else f"{p}/*") for p in patterns)
 
 
 @dataclass

@@ -73,7 +73,8 @@ def test_a_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, changes: dic
     assert all(torch.equal(expected[n], got[n]) for n in expected)
     for name in ("updates.jsonl", "metrics.jsonl"):
         got_log, want_log = (
-            [{k: v for k, v in record.items() if "time" not in k} for record in RunLog(folder).read(name)]
+            # The chain holds digests of records with times in them.
+            [{k: v for k, v in r.items() if "time" not in k and k != "chain"} for r in RunLog(folder).read(name)]
             for folder in (before, tmp_path / "whole")
         )
         assert got_log == want_log and got_log, name
