@@ -2,8 +2,8 @@
 
 A trajectory holds everything that evaluation, rewards and training need: the task, the spec, every transition, every
 model call with its tokens and log-probabilities, the environment's metrics, seed and versions. Prompts of successive
-calls mostly extend each other, so a prompt is stored as what it keeps of the tokens before it, and the rest. Every field
-of the format is described in `docs/trajectories.md`, with a reader of its own.
+calls mostly extend each other, so a prompt is stored as what it keeps of the tokens before it, and the rest.
+`docs/trajectories.md` describes every field of the format and has a reader that stands alone.
 """
 
 from __future__ import annotations

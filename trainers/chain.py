@@ -19,6 +19,9 @@ from trainers.contents import contents, differing, field_digests
 from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES, checkpoints
 from trainers.runlog import FORMAT, round_files, seal_of
 
+SHOWN = 20
+"""Edited records of one file that are listed one by one."""
+
 
 # --- manifests -------------------------------------------------------------------------------------------------------
 
@@ -163,7 +166,9 @@ def _read_file(path: Path, name: str, stated: Mapping[str, Any], problems: list[
 # --- the end of the chain --------------------------------------------------------------------------------------------
 
 
-def check_end(folder: Path, receipts: Sequence[tuple[int, set[str], int]], head: str = "") -> tuple[list[str], list[str]]:
+def check_end(
+    folder: Path, receipts: Sequence[tuple[int, set[str], int]], head: str = ""
+) -> tuple[list[str], list[str]]:
     """What is wrong with the end of the chain, and what nobody can tell.
 
     Args:
@@ -183,7 +188,9 @@ def check_end(folder: Path, receipts: Sequence[tuple[int, set[str], int]], head:
     steps |= {p.name: int(p.name.removeprefix(f"{CHECKPOINT}-")) for p in checkpoints(folder)}
     for name, number in steps.items():
         if number > reached:
-            problems.append(f"{name} is of step {number}, but the receipts end at step {reached}: later ones are missing")
+            problems.append(
+                f"{name} is of step {number}, but the receipts end at step {reached}: later ones are missing"
+            )
     return problems, notes
 
 
@@ -221,9 +228,9 @@ def _check_seal(folder: Path, head: str) -> tuple[list[str], list[str]]:
 
 
 _SEALED = {
-    "last_receipt": f"the last record of {UPDATES} is not the one that was sealed: it was edited or deleted",
-    "updates": f"{UPDATES} has not as many records as were sealed",
-    "manifest": f"{MANIFEST} is not the one that was sealed",
+    "last_receipt": f"the last record of {UPDATES} is not that of {SEAL} (`last_receipt`): it was edited or deleted",
+    "updates": f"{UPDATES} has not as many records as {SEAL} says (`updates`)",
+    "manifest": f"{MANIFEST} is not the one that {SEAL} names (`manifest`)",
     "format": f"{SEAL}: `format` was edited",
 }
 
@@ -235,7 +242,9 @@ def _log_problems(sealed: Any, found: Mapping[str, list[str]]) -> list[str]:
     for name in sorted({*sealed, *found}):
         then, now = sealed.get(name) or [], found.get(name) or []
         if len(then) != len(now):
-            problems.append(f"{name} has {len(now)} records, {len(then)} were sealed")
+            problems.append(f"{name} has {len(now)} records, {SEAL} says {len(then)} (`logs`)")
         edited = [i for i, (a, b) in enumerate(zip(then, now, strict=False), 1) if a != b]
-        problems += [f"{name}, record {i}: logged metrics edited" for i in edited[:20]]
+        problems += [
+            f"{name}, record {i}: logged metrics edited, or its digest in {SEAL} (`logs`)" for i in edited[:SHOWN]
+        ]
     return problems

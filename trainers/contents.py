@@ -26,7 +26,9 @@ EPISODE = {
 }
 STEP = {
     **dict.fromkeys(("step", "text", "choices", "state", "next_text"), OBSERVATIONS),
-    **dict.fromkeys(("action", "error", "valid", "rationale", "candidates", "decision_calls", "turn", "trace"), ACTIONS),
+    **dict.fromkeys(
+        ("action", "error", "valid", "rationale", "candidates", "decision_calls", "turn", "trace"), ACTIONS
+    ),
     **dict.fromkeys(("reward", "terminated", "truncated", "info"), REWARDS),
 }
 CALL = {

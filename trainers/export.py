@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from agentspec.files import write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
 from agentspec.registry import SpecError
-from agentspec.files import write_atomic
 from agentspec.trajectory import versions
 from trainers.run_folder import checkpoints
 from trainers.runlog import RunLog

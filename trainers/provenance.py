@@ -63,7 +63,7 @@ def check_completion(completion: Completion, where: str) -> Iterator[str]:
     forced token is 0.
     """
     ids, logprobs, allowed = completion.token_ids, completion.logprobs, completion.allowed
-    if logprobs and len(logprobs) != len(ids) or allowed and len(allowed) != len(ids):
+    if (logprobs and len(logprobs) != len(ids)) or (allowed and len(allowed) != len(ids)):
         yield f"{where} has {len(ids)} tokens, {len(logprobs)} log-probabilities and {len(allowed)} constraints"
         return
     if any(not math.isfinite(p) or p > 1e-5 for p in logprobs):

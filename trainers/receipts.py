@@ -2,21 +2,20 @@
 
 The trainer writes one from what it holds in memory, the audit makes the same from the recorded episodes and compares
 them field by field. A receipt names the round's episodes with their returns; every row with its advantage and digests
-of what the loss read; the loss denominator; the number of padding rows; and the settings that credit and loss depend on.
+of what the loss read; the loss denominator; the number of padding rows; the settings of credit and loss.
 Equal updates have equal receipts, but for the `chain`: it holds digests of records in which times stand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
 from trainers.contents import short_digest
+from trainers.credit import FIELDS, Gather
 from trainers.runlog import FORMAT, RunLog
-from trainers.batches import Row
-
-Gather = Callable[[list[Any]], list[Any]]
+from trainers.sequences import Row
 
 LOSS_SETTINGS = (
     "loss_type",
@@ -35,25 +34,10 @@ LOSS_SETTINGS = (
 )
 """Fields of a configuration that an update depends on beside those of credit."""
 
-CREDIT_SETTINGS = (
-    "num_generations",
-    "estimator",
-    "gamma",
-    "gigpo_weight",
-    "normalize",
-    "overlong",
-    "overlong_ends",
-    "skip_zero_variance",
-    "train_calls",
-    "train_credits",
-    "mask_truncated",
-    "rewards",
-)
-
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """What an update depends on, of a configuration as plain data."""
-    return {name: jsonable(config[name]) for name in (*CREDIT_SETTINGS, *LOSS_SETTINGS) if name in config}
+    return {name: jsonable(config[name]) for name in (*FIELDS, *LOSS_SETTINGS) if name in config}
 
 
 def row_digest(tokens: Sequence[int], mask: Sequence[int], advantage: float | Sequence[float]) -> str:

@@ -23,12 +23,12 @@ from torch import nn
 from transformers import TrainerState
 from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotate_checkpoints
 
-from agentspec.registry import SpecError
 from agentspec.files import write_atomic
-from trainers.batches import ROWS, Row
+from agentspec.registry import SpecError
+from trainers.batches import ROWS
 from trainers.folder_lock import hold
 from trainers.run_folder import STATE, TRAINER_STATE, checkpoints, last_complete_checkpoint, set_aside
-from trainers.sequences import TokenSequence
+from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:
     from trl import GRPOTrainer as Base
@@ -136,6 +136,15 @@ def _row_from_json(data: dict[str, Any]) -> Row:
     return Row(TokenSequence(**fields), tuple(advantage) if isinstance(advantage, list) else advantage, data["episode"])
 
 
+def _step_of(checkpoint: Path) -> int:
+    """Optimiser steps before a checkpoint."""
+    path = checkpoint / TRAINER_STATE
+    if path.is_file():
+        return int(TrainerState.load_from_json(str(path)).global_step)
+    number = checkpoint.name.rpartition("-")[2]
+    return int(number) if number.isdigit() else 0
+
+
 def rows_of(batches: Sequence[dict[str, Any]] | None) -> tuple[tuple[Row, ...], ...]:
     """The rows of buffered micro-batches."""
     return tuple(tuple(batch[ROWS]) for batch in batches or ())
@@ -171,21 +180,26 @@ class ExactResume(Base):
     def _recorded(self, checkpoint: str) -> Iterator[None]:
         """The run's folder belongs to this run inside, and its manifest is written; the end seals its records.
 
-        A run that does not go on from a checkpoint of this folder begins anew: what is there is set aside.
+        What the folder holds beyond the checkpoint is dropped: the resumed run writes it again. A run that does not go
+        on from a checkpoint of this folder begins anew: what is there is set aside.
 
         Raises:
             SpecError: another run is writing into the folder.
         """
         if not self.accelerator.is_main_process:
+            self.accelerator.wait_for_everyone()  # nobody writes before the main process has cleared the folder
             yield
             return
         folder = Path(self.args.output_dir)
         with hold(folder):
             if not checkpoint or Path(checkpoint).resolve().parent != folder.resolve():
                 set_aside(folder)
-            self.run_log.unseal()
+            else:
+                self.run_log.unseal()
+                self.run_log.rewind_to(_step_of(Path(checkpoint)))
             config, spec = self.args.to_dict(), self.args.spec.to_data()
             self.run_log.manifest(config=config, spec=spec, resumed_from=checkpoint)
+            self.accelerator.wait_for_everyone()
             yield
             print(f"records of {folder} sealed; head of the chain: {self.run_log.seal()}", file=sys.stderr)
 
@@ -205,9 +219,6 @@ class ExactResume(Base):
         self._step, self._round, self._memory = state.step, state.round, state.memory
         if state.buffered:
             self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
-        if self.accelerator.is_main_process:
-            self.run_log.rewind_to(self.state.global_step)
-        self.accelerator.wait_for_everyone()  # before anyone writes episodes again
 
 
 __all__ = [

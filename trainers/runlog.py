@@ -93,7 +93,7 @@ class RunLog:
             self.seal()
 
     def receipt(self, record: Mapping[str, Any], files: Mapping[str, Any]) -> None:
-        """Append a receipt, chained to the one before it, to the manifest and to its round's files (as of `written`)."""
+        """Append a receipt, chained to the one before it, the manifest and its round's files (as of `written`)."""
         chain = {"manifest": self._digest(MANIFEST), "files": dict(files), "previous": last_digest(self.folder)}
         append_lines(self.folder / UPDATES, {**record, "chain": chain})
 
@@ -145,7 +145,7 @@ class RunLog:
 
 
 def round_files(folder: Path) -> list[Path]:
-    """The trajectory files of all rounds, in `trajectories` and in every other folder of the run that has such files."""
+    """The trajectory files of all rounds, in `trajectories` and in every other folder of the run that has some."""
     return sorted(p for p in folder.glob("*/[0-9][0-9][0-9][0-9][0-9][0-9]*.jsonl") if p.is_file())
 
 
