@@ -3,7 +3,7 @@
     python -m benchmarks.tamper [--json]
 
 A tiny honest run is made (a random model, groups of two, a memory that asks the model, menus, evaluation while
-training), and then, on a copy each time, one thing is changed and the audit is run: each of the kinds of
+training). Then, on a copy each time, one thing is changed and the audit is run: each of the kinds of
 `benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, one line of metrics and one
 of evaluations. Honest runs of every estimator, and of other settings that change what an update is made of, must have no
 violation at all.

@@ -137,12 +137,14 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
 
     A call extends the longest sequence that its prompt contains as a prefix. Two completions of one prompt never share
     a row: the second starts its own. A call made after the last step (`tag.step` is the number of transitions, a
-    memory that stores the last one, say) earns nothing in this episode and is left out.
+    memory that stores the last one, say) earns nothing in this episode and is left out; calls of
+    helper models (the spec's `roles`) are never trained.
     """
     train = train or TrainFilter()
     rows: list[TokenSequence] = []
     for call in trajectory.calls:
-        if call.tag.step >= len(trajectory.transitions):
+        helper = matches(call.tag.path, trajectory.spec.get("roles", {}))
+        if helper or call.tag.step >= len(trajectory.transitions):
             continue
         for index in train.completions(call):
             row = _extendable(rows, call.prompt_ids)
