@@ -256,3 +256,14 @@ def apply(folder: Path, kind: str) -> None:
         return
     for file, change in KINDS[kind]:
         edit(folder / file, change)
+
+
+def findings(run: Path, head: str = "") -> list[str]:
+    """Violations that the audit finds; records that cannot be read at all are one."""
+    from agentspec.registry import SpecError
+    from trainers.audit import audit
+
+    try:
+        return [v for update in audit(run, head=head) for v in update.violations]
+    except (SpecError, ValueError) as error:
+        return [str(error)]

@@ -5,8 +5,8 @@
 A tiny honest run is made (a random model, groups of two, a memory that asks the model, menus, evaluation while
 training). Then, on a copy each time, one thing is changed and the audit is run: each of the kinds of
 `benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, one line of metrics and one
-of evaluations. Honest runs of every estimator, and of other settings that change what an update is made of, must have no
-violation at all.
+of evaluations. Honest runs of every estimator, and of other settings that change what an update is made of, must have
+no violation at all.
 
 Files that are only shown to people or can be computed again (plots, evaluation tables, the weights, what the terminal
 saw) are no records and are not covered: `excepted` names them. Times are recorded, and covered like everything else.
@@ -36,6 +36,7 @@ from benchmarks.edits import (
     UPDATES,
     apply,
     change_leaf,
+    findings,
     leaves,
     read,
     spelled,
@@ -165,17 +166,6 @@ def every_leaf(run: Path, file: str, number: int, every: int, tally: Tally) -> N
         path.write_text(spelled(path, edited), encoding="utf-8")
         tally.add(f"{file}, record {number + 1}: {'.'.join(map(str, where))}", findings(run), [file])
     path.write_bytes(whole)
-
-
-def findings(run: Path, head: str = "") -> list[str]:
-    """Violations that the audit finds; records that cannot be read at all are one."""
-    from agentspec.registry import SpecError
-    from trainers.audit import audit
-
-    try:
-        return [v for update in audit(run, head=head) for v in update.violations]
-    except (SpecError, ValueError) as error:
-        return [str(error)]
 
 
 # --- honest runs -----------------------------------------------------------------------------------------------------
