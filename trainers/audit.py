@@ -114,11 +114,9 @@ def _steps_per_round(record: Mapping[str, Any]) -> int:
     """Optimiser steps that are made of one generation round."""
     given = record.get("settings")
     names = ("steps_per_generation", "num_iterations", "gradient_accumulation_steps")
-    values = [given.get(name) if isinstance(given, Mapping) else None for name in names]
-    if not all(isinstance(v, int) and v > 0 for v in values):
-        return 1
-    generated, iterations, accumulated = values
-    return max(1, generated * iterations // accumulated)
+    values = [given.get(name) for name in names] if isinstance(given, Mapping) else []
+    counts = [v for v in values if isinstance(v, int) and v > 0]
+    return max(1, counts[0] * counts[1] // counts[2]) if len(counts) == 3 else 1
 
 
 def _audit_update(

@@ -208,7 +208,7 @@ def _check_seal(folder: Path, head: str) -> tuple[list[str], list[str]]:
         if head:
             return [f"{SEAL} is missing, and the head {head} is that of a run that had ended"], []
         return [], [f"no {SEAL}: the run has not ended, or was cut short; what stood after its last receipt is unknown"]
-    problems = []
+    problems: list[str] = []
     blob = path.read_bytes()
     try:
         seal = json.loads(blob)

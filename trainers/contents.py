@@ -83,7 +83,7 @@ def _records(value: Any) -> bool:
 
 def field_digests(data: Mapping[str, Any]) -> dict[str, str]:
     """`field` -> digest, and `field.key` for each key of a field that is a mapping."""
-    found = {}
+    found: dict[str, str] = {}
     for name, value in data.items():
         if isinstance(value, Mapping):
             found |= {f"{name}.{key}": short_digest(inner) for key, inner in value.items()}
