@@ -176,7 +176,10 @@ def honest_runs(folder: Path, head: str) -> dict[str, list[str]]:
     from trainers.estimators import ESTIMATORS
 
     found = {"edited below": findings(folder / "honest", head)}
-    runs = {f"estimator: {name}": {"estimator": name, "gamma": 0.9, "max_steps": 1} for name in ESTIMATORS}
+    runs: dict[str, dict[str, Any]] = {
+        f"estimator: {name}": {"estimator": name, **({"gamma": 0.9} if "gamma" in spec.needs else {})}
+        for name, spec in ESTIMATORS.items()
+    }
     for number, (name, changes) in enumerate({**runs, **HONEST}.items()):
         head = train(folder / f"honest-{number}", **{"max_steps": 1, **changes})
         found[name] = findings(folder / f"honest-{number}", head)

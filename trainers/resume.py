@@ -25,9 +25,9 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from trainers.batches import ROWS
 from trainers.folder_lock import hold
-from trainers.run_folder import STATE, TRAINER_STATE, checkpoints, last_complete_checkpoint, set_aside
+from trainers.micro_batches import ROWS
+from trainers.run_folder import STATE, TRAINER_STATE, set_aside
 from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
         "format": FORMAT,
         "step": state.step,
         "round": state.round,
-        "buffered": [[_row_to_json(r) for r in hand] for hand in state.buffered],
+        "buffered": [[_row_to_json(r) for r in rows] for rows in state.buffered],
         "memory": None if state.memory is None else base64.b64encode(state.memory).decode(),
     }
     write_atomic(Path(folder) / _name(rank), json.dumps(data))
@@ -218,18 +218,4 @@ class ExactResume(Base):
             return
         self._step, self._round, self._memory = state.step, state.round, state.memory
         if state.buffered:
-            self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
-
-
-__all__ = [
-    "ExactResume",
-    "ScaffoldState",
-    "checkpoints",
-    "last_complete_checkpoint",
-    "load_state",
-    "restore_finished",
-    "rows_of",
-    "save_state",
-    "set_aside",
-    "unmark",
-]
+            self._buffered_inputs = self._collated([list(rows) for rows in state.buffered])
