@@ -163,6 +163,6 @@ if __name__ == "__main__":
 
     from trl import GRPOConfig
 
-    from agentspec.state import write_atomic
+    from agentspec.files import write_atomic
 
     write_atomic(Path(__file__).resolve().parents[1] / "docs" / "training_fields.md", page(GRPOConfig))
