@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gymnasium
 
+from agentspec.registry import register
+
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
 }
@@ -19,3 +21,9 @@ def register_all() -> None:
 
 
 register_all()
+register(
+    "env",
+    "deliverybench",
+    "agentspec/DeliveryBench-v0",
+    "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from agentspec.declaration import Declaration
 from agentspec.types import AgentInput, Task
 
 
@@ -18,6 +19,10 @@ class DeliveryBenchPerception:
     Args:
         images: pass the map picture on (for vision-language policies).
     """
+
+    declaration = Declaration(
+        "the four components of DeliveryBench: image, instruction, state, action schema",
+    )
 
     def __init__(self, images: bool = False) -> None:
         self.images = images

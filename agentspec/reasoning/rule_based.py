@@ -6,6 +6,7 @@ start. Both answer in the environment's language: a choice of the menu where the
 
 from __future__ import annotations
 
+from agentspec.declaration import Declaration
 from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier, Style
 from agentspec.envs.deliverybench.env import city_of
@@ -29,6 +30,12 @@ class RuleBased(Stateless):
         bagging: pack food into the bag after every pick-up.
         hasty: move at the accelerated pace while nothing fragile is carried.
     """
+
+    declaration = Declaration(
+        "the environment's scripted expert: no model, a baseline and demonstrator",
+        envs=("deliverybench",),
+        aliases=("simple",),
+    )
 
     def __init__(self, services: Services, bagging: bool = True, hasty: bool = True) -> None:
         self.services = services
@@ -63,6 +70,12 @@ class RuleBased(Stateless):
 
 class RandomLegal(Stateless):
     """A random one of the actions that make sense now: of the menu where there is one, else of the menu's calls."""
+
+    declaration = Declaration(
+        "a random sensible action: no model, the floor",
+        envs=("deliverybench",),
+        name="random",
+    )
 
     def __init__(self, services: Services) -> None:
         self.courier = RandomCourier(services.rng)
