@@ -2,7 +2,7 @@
 
 ::
 
-    perception: deliverybench
+    perception: generic
     memory: {name: base, window: 5}
     reasoning: react
     reflection: none
@@ -91,7 +91,7 @@ class AgentSpec:
     calls are metered and never trained. `imports` brings in modules of your own (see :mod:`agentspec.registry`).
     """
 
-    perception: ModuleSpec = ModuleSpec("deliverybench")
+    perception: ModuleSpec = ModuleSpec("generic")
     memory: ModuleSpec = ModuleSpec("none")
     reasoning: ModuleSpec = ModuleSpec("direct")
     reflection: ModuleSpec = ModuleSpec("none")

@@ -7,8 +7,8 @@ chains do stay in the conversation, as sampled.
 
 from __future__ import annotations
 
-from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.actions import parse_action
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import assistant, user
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -40,7 +40,7 @@ class ChainOfThought(Stateless):
     declaration = Declaration(
         "thinks step by step, then acts; the chain is not carried on",
         calls=CallProfile(step=(1, 2)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
     )
 
     def __init__(

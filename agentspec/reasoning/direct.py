@@ -14,7 +14,7 @@ class Direct(Stateless):
     declaration = Declaration(
         "answers with the action only",
         calls=CallProfile(step=(1, 1)),
-        purposes={"act": Purpose("step")},
+        purposes=Purpose.each("step", "act"),
     )
 
     def __init__(self, services: Services) -> None:

@@ -105,7 +105,7 @@ class LanguageAgentTreeSearch:
         "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
         calls=CallProfile(step=(1, 1121)),
         rl=CallProfile(step=(1, 20)),
-        purposes={"propose": Purpose("step"), "value": Purpose("step"), "reflect": Purpose("step"), "world": Purpose("step")},
+        purposes=Purpose.each("step", "propose", "value", "reflect", "world"),
         needs=("n", "snapshots"),
         waived={"snapshots": ("world", "model")},
     )

@@ -77,7 +77,7 @@ class PlanAndSolve:
         "a plan of sub-goals that persists, then one sub-goal at a time; plans anew when it fails or is done",
         calls=CallProfile(step=(1, 3)),
         rl=CallProfile(step=(1, 2)),
-        purposes={"plan": Purpose("step"), "think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "plan", "think", "act"),
     )
 
     def __init__(

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import re
 
-from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.actions import parse_action
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.protocols import Services
 from agentspec.reasoning.common import ask_action, default_answer, last_action_line, sampled, static_prompt, user_turn
 from agentspec.state import dump_state, load_state
@@ -43,7 +43,7 @@ class ReAct:
     declaration = Declaration(
         "a growing transcript of thought, action and observation",
         calls=CallProfile(step=(1, 11)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
     )
 
     def __init__(

@@ -90,7 +90,7 @@ class SelfConsistency(Stateless):
         "independent chains of thought, and a vote over their actions",
         calls=CallProfile(step=(1, 6)),
         rl=CallProfile(step=(1, 4)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
         needs=("n",),
     )
 
