@@ -112,6 +112,10 @@ class TreeOfThoughts(Stateless):
         calls=CallProfile(step=(1, 20)),
         rl=CallProfile(step=(1, 8)),
         purposes=Purpose.each("step", "propose", "value", "vote"),
+        small=(
+            {"preset": "rl", "search_strategy": "DFS"},
+            {"preset": "rl", "evaluation_strategy": "vote", "selection": "sample"},
+        ),
         needs=("n",),
     )
 

@@ -88,6 +88,8 @@ class Retroformer(Reflexion):
         "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
         calls=CallProfile(episode=(0, 1)),
         purposes={"reflect": Purpose("episode")},
+        small=({"when": "start"},),
+        small_calls=CallProfile(retrieve=(0, 1)),
     )
 
     name = "retroformer"
