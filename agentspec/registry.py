@@ -136,11 +136,11 @@ class Registry:
         """
         self._require_kind(kind)
         if kind not in self._complete:
-            self._complete.add(kind)
             for name in self._files(kind):
                 self._from_file(kind, name)
             for point in _entry_points(kind):
                 self._from_entry_point(point)
+            self._complete.add(kind)
         return dict(sorted(self._known[kind].items()))
 
     def get(self, kind: str, name: str) -> Entry:
