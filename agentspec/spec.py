@@ -29,11 +29,11 @@ import yaml
 from agentspec.actions import suggest
 from agentspec.context import Context, Layout, Placement
 from agentspec.llm.helpers import check_helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.recorder import Budget, ModuleLLM, Recorder, derive_seed
 from agentspec.parameters import check_parameters, check_types
 from agentspec.protocols import Embedder, Services, StepClock
 from agentspec.registry import REGISTRY, SpecError, import_modules, snake_case
-from agentspec.tokens import estimate_tokens
 from agentspec.types import Sampling
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class AgentSpec:
             from agentspec.embedding import check_embedder
 
             check_embedder(self.embedder)
-        self._build(Recorder(_NoBackend(), episode="", seed=0), None)
+        self._build(Recorder(NoLLM(), episode="", seed=0), None)
 
     @classmethod
     def from_yaml(cls, source: str | Path) -> AgentSpec:
@@ -277,17 +277,6 @@ class AgentSpec:
 
 _FIELDS = [f.name for f in dataclasses.fields(AgentSpec)]
 _PLAIN = ("layout", "max_turns", "scope", "recall", "recall_tokens", "lesson_tokens", "embedder", "roles")
-
-
-class _NoBackend:
-    """Stands in for a model while a spec is validated: modules are built, and nothing is asked."""
-
-    name = "none"
-    capabilities: frozenset[str] = frozenset()
-    max_context = 0
-
-    def count_tokens(self, text: str) -> int:
-        return estimate_tokens(text)
 
 
 def _dataclass(cls: Any, value: Any, where: str) -> Any:
