@@ -194,6 +194,16 @@ class AgentSpec:
         module: ModuleSpec = getattr(self, kind)
         return REGISTRY.get(kind, module.name).needs_with(module.params)
 
+    def call_paths(self) -> list[str]:
+        """`module/purpose` paths of the calls that the modules may make, as patterns over calls match them."""
+        paths = []
+        for kind in MODULE_KINDS:
+            module: ModuleSpec = getattr(self, kind)
+            entry = REGISTRY.get(kind, module.name)
+            if entry.calls.calls_model:
+                paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
+        return paths
+
     def check(self, capabilities: frozenset[str], who: str) -> None:
         """Refuse a backend that lacks what a module needs.
 

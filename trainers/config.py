@@ -15,8 +15,8 @@ from trl import GRPOConfig
 
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
-from agentspec.registry import REGISTRY, SpecError
-from agentspec.spec import MODULE_KINDS, AgentSpec, load_yaml
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec, load_yaml
 from rewards import RewardSet
 from trainers.estimators import ESTIMATORS
 from trainers.sequences import TrainFilter, unmatched_patterns
@@ -298,14 +298,8 @@ class ScaffoldConfig(GRPOConfig):
 
 
 def call_paths(spec: AgentSpec) -> list[str]:
-    """``module/...`` paths of the modules that may call the model, for checking patterns before a run."""
-    paths = []
-    for kind in MODULE_KINDS:
-        module = getattr(spec, kind)
-        entry = REGISTRY.get(kind, module.name)
-        if entry.calls.calls_model:
-            paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
-    return paths
+    """`module/purpose` paths of the calls an agent may make, for checking patterns before a run."""
+    return spec.call_paths()
 
 
 def agent_spec(value: Any) -> AgentSpec:
