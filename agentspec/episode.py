@@ -143,7 +143,7 @@ class Runner:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
         self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
-        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items()}
+        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items() if self.spec.helped(pattern)}
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:

@@ -276,12 +276,19 @@ class AgentSpec:
                 raise SpecError(f"{kind} {spec.name!r}: {error}") from error
         return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
 
+    def helped(self, pattern: str) -> list[str]:
+        """The modules that a pattern of `roles` names."""
+        return [module for module in self._modules() if fnmatchcase(module, pattern)]
+
+    def _modules(self) -> list[str]:
+        return [f"{kind}.{getattr(self, kind).short}" for kind in MODULE_KINDS[1:]]
+
     def _check_roles(self) -> None:
         """Refuse roles of no module, and backends that say neither what nor where."""
-        modules = [f"{kind}.{getattr(self, kind).short}" for kind in MODULE_KINDS]
         for pattern, backend in self.roles.items():
-            if not any(fnmatchcase(module, pattern) for module in modules):
-                raise SpecError(f"roles: {pattern!r} matches none of the modules {', '.join(modules)}")
+            if not self.helped(pattern):
+                modules = ", ".join(self._modules())
+                raise SpecError(f"roles: {pattern!r} matches none of the modules {modules}")
             check_helper(f"roles: {pattern!r}", backend)
 
 
