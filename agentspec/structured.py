@@ -21,6 +21,7 @@ from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, 
 T = TypeVar("T")
 
 _THINKING = re.compile(r"<(think|thinking|reasoning)>.*?(?:</\1>|\Z)", re.DOTALL | re.IGNORECASE)
+_THINKING_ENDS = re.compile(r"\A.*</(think|thinking|reasoning)>", re.DOTALL | re.IGNORECASE)
 _STARTS = re.compile(r"[\[{]")
 _MOST_STARTS = 64  # values tried in one text; a longer search only serves texts that are no answer
 HUGE = 1e300
@@ -78,8 +79,12 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
 
 
 def without_thinking(text: str) -> str:
-    """The text without its reasoning blocks, closed or cut off."""
-    return _THINKING.sub("", text).strip()
+    """The text without its reasoning blocks: closed, cut off, or opened by the prompt.
+
+    >>> without_thinking("hm</think>Yes. <think>or")
+    'Yes.'
+    """
+    return _THINKING_ENDS.sub("", _THINKING.sub("", text)).strip()
 
 
 def _values(text: str) -> Iterator[Any]:
@@ -124,7 +129,11 @@ def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: P
         hints = get_type_hints(schema)
         defaults = {f.name: f for f in dataclasses.fields(schema) if _has_default(f)}
         fields = {f.name: hints[f.name] for f in dataclasses.fields(schema) if f.init}
-        return schema(**_check_fields(value, fields, defaults, where))
+        given = _check_fields(value, fields, defaults, where)
+        try:
+            return schema(**given)
+        except (TypeError, ValueError) as error:  # the class's own checks
+            raise ParseError(f"{where}: {error}") from error
     origin, arguments = get_origin(schema), get_args(schema)
     if schema is Any:
         return value

@@ -29,6 +29,15 @@ class Note:
     tags: list[str] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Share:
+    part: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.part <= 1:
+            raise ValueError(f"part must lie between 0 and 1, not {self.part}")
+
+
 NOTE = json_of(Note)
 
 
@@ -53,6 +62,7 @@ def problems(given: Services) -> dict[str, int]:
         '{"text": "hot food", "weight": 2}',
         'Here it is:\n```json\n{"text": "hot food", "weight": 2.0, "tags": []}\n```\nGood luck!',
         '<think>{"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2, "more": 1}',
+        'a prompt may open it: {"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2}',
         'As in {the rules}, [see above]: {"text": "hot food", "weight": 2} and so on {"text": "b", "weight": 1}',
     ],
 )
@@ -63,6 +73,7 @@ def test_json_is_found_in_what_is_written_around_it(text: str) -> None:
 @pytest.mark.parametrize(
     ("schema", "text", "problem"),
     [
+        (Share, '{"part": 2}', "part must lie between 0 and 1"),
         (Note, "Nothing to say.", "there is no JSON in it"),
         (Note, '{"text": "a"}', "the answer lacks 'weight'"),
         (Note, '{"text": 3, "weight": 1}', "'text' must be string, not 3"),
