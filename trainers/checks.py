@@ -18,7 +18,7 @@ from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
-from trainers.advantages import ESTIMATORS
+from trainers.estimators import ESTIMATORS
 from trainers.fields import field_rules
 from trainers.sequences import unmatched_patterns
 
@@ -40,7 +40,6 @@ REFUSED_LOSSES = {
     "sapo": "it averages per row and has no test against stock TRL here",
     "vespo": "its weights are products over one row, not over the episode",
 }
-STEP_ESTIMATORS = ("reward_to_go", "gigpo")
 ENDS = ("context", "budget", "max_steps", "truncated")
 TOKEN_MODES = ("token_truncate", "token_mask")
 REFLECTION, REWARD = "retroformer", "reflection_gain"
@@ -113,7 +112,7 @@ def check_reporters(config: Any) -> None:
 def check_names(config: ScaffoldConfig) -> None:
     """Every name is among its alternatives."""
     for name, known in (
-        ("estimator", (*ESTIMATORS, *STEP_ESTIMATORS)),
+        ("estimator", tuple(ESTIMATORS)),
         ("normalize", ("token", "rollout")),
         ("overlong", ("mask", "keep", "drop")),
         ("memory_carry", ("first", "best")),
