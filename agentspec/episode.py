@@ -120,6 +120,9 @@ class Runner:
         timeout_s: limit of every environment call, in seconds (``None``: none).
         max_steps: most steps of an episode, on top of the environment's own limit.
         policy: label of the policy, for tables.
+        on_done: called with each episode when it has ended.
+        on_step: called with the task and each step of its episode when it was taken.
+        progress: number of jobs -> what to call after each (`agentspec.progress.episode_progress`).
     """
 
     spec: AgentSpec
@@ -132,6 +135,8 @@ class Runner:
     embedder: Embedder | None = None
     policy: str = ""
     on_done: Callable[[Trajectory], None] | None = None
+    on_step: Callable[[Task, Transition], None] | None = None
+    progress: Callable[[int], Callable[[Trajectory], None]] | None = None
 
     def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """Run all jobs; trajectories come back in the order of the jobs."""
@@ -141,13 +146,14 @@ class Runner:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
         self.spec.check(frozenset(llm.capabilities) | {"snapshots"}, f"backend {llm.name!r}")
+        progress = self.progress(len(jobs)) if self.progress else None
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:
             async with gate:
                 trajectory = await self._episode(job, llm)
-            if self.on_done:
-                self.on_done(trajectory)
+            for tell in filter(None, (self.on_done, progress)):
+                tell(trajectory)
             return trajectory
 
         return list(await asyncio.gather(*(guarded(job) for job in jobs)))
@@ -196,6 +202,8 @@ class Runner:
                     ended = "budget"
                     break
                 transitions.append(transition)
+                if self.on_step:
+                    self.on_step(job.task, transition)
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)

@@ -21,6 +21,7 @@ from typing import Any
 from agentspec.actions import suggest
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.progress import episode_progress
 from agentspec.llm.pricing import Prices
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -182,6 +183,7 @@ async def _play(
             max_steps=settings.max_steps,
             prices=settings.prices,
             policy=setting.policy.name,
+            progress=episode_progress,
             on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
         )
         if setting.spec.scope == "run":

@@ -201,7 +201,7 @@ def test_a_value_error_is_expected_when_our_code_raised_it() -> None:
 
 def test_one_line() -> None:
     assert one_line(SpecError("a\n  b")) == "a b"
-    assert one_line(ModuleNotFoundError("No module named 'peft'", name="peft.x")).endswith("'agentspec[train]'")
+    assert one_line(ModuleNotFoundError("No module named 'peft'", name="peft.x")).endswith("'agentspec-rl[train]'")
     assert one_line(FileNotFoundError(2, "No such file or directory", "x.yaml")).startswith("x.yaml: No such file")
     with pytest.raises(SystemExit):
         fail("plain text")

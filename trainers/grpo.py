@@ -20,6 +20,7 @@ from trl import GRPOTrainer
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.progress import episode_progress
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
@@ -161,6 +162,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             make_env=self._make_env,
             concurrency=self.args.rollout_concurrency or None,
             timeout_s=self.args.env_timeout_s,
+            progress=episode_progress if self.accelerator.is_main_process else None,
             policy=f"step-{self.state.global_step}",
         )
 

@@ -31,6 +31,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _version() -> str:
-    from importlib import metadata
+    from agentspec import __version__
 
-    return f"{PROGRAM} {metadata.version(PROGRAM)}"
+    return f"{PROGRAM} {__version__}"
