@@ -21,8 +21,8 @@ from typing import Any
 from agentspec.actions import suggest
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
-from agentspec.progress import episode_progress
 from agentspec.llm.pricing import Prices
+from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, jsonable, write_trajectories

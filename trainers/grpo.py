@@ -26,6 +26,7 @@ from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
 from trainers.batches import ROWS, Row, blank_row, collate, deal, rows_logprobs
 from trainers.call_metrics import CallMetrics, clipped_tokens, truncated_calls
+from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
 from trainers.credit import CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
@@ -37,7 +38,7 @@ from trainers.validation import validate, validation_scaffolds
 from trainers.vllm import importance_ratio, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
