@@ -43,12 +43,11 @@ def model_card(title: str, config: Mapping[str, Any], spec: Any, *, adapter: boo
         "tags": ["agentspec"],
     }
     what = f"A PEFT adapter for {name or 'a model that its run did not name'}" if adapter else f"Weights from {name}"
-    rewards = config.get("rewards")
     facts = {
         "base model": name,
         "weights": note,
         "environment": _inline(config.get("environment")),
-        "rewards": _inline(rewards),
+        "rewards": _inline(config.get("rewards")),
         "estimator and loss": ", ".join(str(config[k]) for k in ("estimator", "loss_type") if config.get(k)),
         "learning rate": config.get("learning_rate"),
         "rollouts per task": config.get("num_generations"),
@@ -58,14 +57,8 @@ def model_card(title: str, config: Mapping[str, Any], spec: Any, *, adapter: boo
     lines += [f"| {key} | {value} |" for key, value in facts.items() if value not in (None, "")]
     if spec:
         policy = f"--policy {name or 'BASE'} --adapter FOLDER" if adapter else "--policy FOLDER"
-        lines += [
-            "",
-            "The agent, as `agent.yaml`:",
-            "",
-            "```yaml",
-            yaml.safe_dump(spec, sort_keys=False).rstrip(),
-            "```",
-        ]
+        agent = yaml.safe_dump(spec, sort_keys=False).rstrip()
+        lines += ["", "The agent, as `agent.yaml`:", "", "```yaml", agent, "```"]
         lines += ["", "It acts again with", "", f"    agentspec run {policy} --spec agent.yaml"]
     return "\n".join(lines) + "\n"
 
@@ -75,12 +68,9 @@ def base_name(model: str) -> str:
     return Path(model).name if Path(model).is_dir() or re.match(r"[~./]", model) else model
 
 
-def _inline(value: Any) -> str:
-    return (
-        yaml.safe_dump(value, default_flow_style=True, width=1 << 20).strip()
-        if isinstance(value, dict)
-        else value or ""
-    )
+def _inline(value: Any) -> Any:
+    """A mapping on one line; any other value as it is."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1 << 20).strip() if isinstance(value, dict) else value
 
 
 class OwnCards(Base):
