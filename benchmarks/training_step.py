@@ -106,7 +106,7 @@ def our_update(trainer: Any, rows: Sequence[Any], count: int) -> Callable[[], No
     _accumulate(trainer, count)
 
     def run() -> None:
-        for part in trainer._micro_batches(rows, count):
+        for part in trainer._collated(trainer._partitioned(rows)):
             trainer._compute_loss(trainer.model, part).backward()
 
     return run

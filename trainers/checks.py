@@ -18,28 +18,14 @@ from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
-from trainers.estimators import ESTIMATORS
+from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import field_rules
+from trainers.losses import LOSSES, loss
 from trainers.sequences import unmatched_patterns
 
 if TYPE_CHECKING:
     from trainers.config import ScaffoldConfig
 
-EXACT_LOSSES = ("dapo", "cispo")
-"""Loss types normalised by all trained tokens of the update: the same objective however many rows an episode has."""
-
-ROW_LOSSES = {
-    "grpo": "each row weighs the same, so an episode of three rows weighs three times one of a single row",
-    "bnpo": "each micro-batch is normalised by its own tokens, so the weights depend on how rows were dealt",
-    "dr_grpo": "the sum is divided by rows x max_completion_length, so the scale falls as rows per episode grow",
-}
-"""Loss types that depend on how episodes split into rows, and how."""
-
-REFUSED_LOSSES = {
-    "luspo": "it sums per row, so an episode counts once per row",
-    "sapo": "it averages per row and has no test against stock TRL here",
-    "vespo": "its weights are products over one row, not over the episode",
-}
 ENDS = ("context", "budget", "max_steps", "truncated")
 TOKEN_MODES = ("token_truncate", "token_mask")
 REFLECTION, REWARD = "retroformer", "reflection_gain"
@@ -61,6 +47,7 @@ def check(config: ScaffoldConfig) -> None:
     check_calls(config)
     check_lora(config)
     check_loss(config)
+    check_rounds(config)
     check_validation(config)
     check_vllm(config)
 
@@ -72,7 +59,10 @@ def check_fields(config: Any) -> None:
         value = getattr(config, name, rule.allowed[0] if rule.allowed else None)
         if rule.status != "used" and value not in rule.allowed:
             _refuse_field(name, value)
-    if config.max_completion_length != _default(config, "max_completion_length") and config.loss_type != "dr_grpo":
+    if (
+        config.max_completion_length != _default(config, "max_completion_length")
+        and "max_completion_length" not in loss(config.loss_type).uses
+    ):
         raise SpecError(
             f"max_completion_length is {config.max_completion_length}, which only loss_type 'dr_grpo' reads (as its "
             "constant length); the length of an answer is set under `agent: {sampling: {max_tokens: ...}}`"
@@ -117,6 +107,7 @@ def check_names(config: ScaffoldConfig) -> None:
         ("overlong", ("mask", "keep", "drop")),
         ("memory_carry", ("first", "best")),
         ("packing", ("tree", "padded")),
+        ("reference", ("initial", "base")),
         ("batching", ("auto", *get_args(Batching))),
     ):
         _known(getattr(config, name), known, name)
@@ -188,19 +179,35 @@ def check_lora(config: ScaffoldConfig) -> None:
 
 
 def check_loss(config: ScaffoldConfig) -> None:
-    """The loss speaks of episodes, or says how it depends on rows (`notes`)."""
-    if config.loss_type in REFUSED_LOSSES:
+    """The loss is offered, and no setting of it or of the estimator changes nothing."""
+    spec = loss(config.loss_type)
+    if config.delta is not None and "delta" not in spec.uses:
+        raise SpecError(f"delta {config.delta} changes nothing with loss_type {spec.name!r}; leave it out")
+    for name in ("gamma", "gigpo_weight"):
+        if getattr(config, name) != _default(config, name) and name not in estimator(config.estimator).needs:
+            readers = ", ".join(e.name for e in ESTIMATORS.values() if name in e.needs)
+            raise SpecError(
+                f"{name} {getattr(config, name)} changes nothing with estimator {config.estimator!r}; leave it out, or "
+                f"use one that reads it: {readers}"
+            )
+    if config.normalize == "rollout" and not spec.per_token:
         raise SpecError(
-            f"loss_type {config.loss_type!r} is not offered: {REFUSED_LOSSES[config.loss_type]}; "
-            f"use one of {', '.join((*EXACT_LOSSES, *ROW_LOSSES))}"
+            f"normalize 'rollout' with loss_type {spec.name!r}: its denominator is not the number of trained tokens; "
+            f"use one of {', '.join(name for name, s in LOSSES.items() if s.per_token)}"
         )
-    if config.normalize == "rollout" and config.loss_type not in EXACT_LOSSES:
-        raise SpecError(
-            f"normalize 'rollout' with loss_type {config.loss_type!r}: its denominator is not the number of trained "
-            f"tokens; use one of {', '.join(EXACT_LOSSES)}"
-        )
+
+
+def check_rounds(config: ScaffoldConfig) -> None:
+    """Groups can be compared, and an update reads one generation round, whole or in equal parts."""
     if config.num_generations < 2:
         raise SpecError(f"num_generations is {config.num_generations}: a group needs at least 2 rollouts to compare")
+    if config.steps_per_generation % config.gradient_accumulation_steps:
+        raise SpecError(
+            f"gradient_accumulation_steps {config.gradient_accumulation_steps} with steps_per_generation "
+            f"{config.steps_per_generation}: an update would mix generation rounds, each with a denominator of its "
+            f"own; set steps_per_generation to {config.gradient_accumulation_steps} (the same rollouts in one round), "
+            "or to a multiple of it (several updates a round)"
+        )
 
 
 def check_validation(config: ScaffoldConfig) -> None:
@@ -272,9 +279,13 @@ def check_retroformer(config: ScaffoldConfig) -> None:
 
 def notes(config: ScaffoldConfig) -> list[str]:
     """What a user should know about a configuration that runs."""
-    if config.loss_type in ROW_LOSSES:
-        return [f"loss_type {config.loss_type}: {ROW_LOSSES[config.loss_type]}; 'dapo' does not depend on rows"]
-    return []
+    found = []
+    spec = loss(config.loss_type)
+    if spec.depends_on_rows:
+        found.append(f"loss_type {spec.name}: {spec.depends_on_rows}; 'dapo' does not depend on rows")
+    if config.top_entropy_quantile < 1:
+        found.append("top_entropy_quantile: the quantile is of each micro-batch, so it depends on how rows are split")
+    return found
 
 
 def _default(config: Any, name: str) -> Any:

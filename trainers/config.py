@@ -42,6 +42,8 @@ class ScaffoldConfig(GRPOConfig):
         train_calls: patterns over ``module/purpose`` of the calls that are trained.
         train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
         rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
+        reference: with ``beta`` above 0, what the policy is kept near: the ``initial`` policy, as training began (its
+            adapter included), or the ``base`` model without any adapter.
         estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
@@ -91,6 +93,7 @@ class ScaffoldConfig(GRPOConfig):
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
     rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
     estimator: str = field(default="grpo", metadata={"help": ", ".join(ESTIMATORS)})
+    reference: str = field(default="initial", metadata={"help": "initial or base; with beta above 0"})
     gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
     gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
     skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})

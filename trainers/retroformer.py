@@ -32,7 +32,7 @@ from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.trajectory import Trajectory, write_trajectories
 from trainers.checks import REFLECTION, REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
-from trainers.credit import ScoredEpisode
+from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
 from trainers.rollouts import collect
@@ -105,9 +105,9 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         if any(gather_object([any(map(has_lesson, self.last_episodes))])):
             super()._check_trained()
 
-    def _log_episodes(self) -> None:
+    def _log_episodes(self, credited: Credited) -> None:
         """As for any run; also what the lessons were worth, and the trials they are about."""
-        super()._log_episodes()
+        super()._log_episodes(credited)
         firsts = [e.trajectory for e in self._first_trials]
         scored = [t for t in firsts if t.scorable]
         gains = [float(t.metrics["reflection/reward"]) for t in self.last_episodes if t.scorable and has_lesson(t)]
