@@ -27,11 +27,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     from agentspec.cli.ours import claim_packages
     from agentspec.cli.parser import build_parser
+    from agentspec.registry import import_modules
 
     arguments = build_parser().parse_args(argv)
     with expected_errors():
         claim_packages()
         try:
+            import_modules(arguments.imports)
             code: int = arguments.command(arguments)
             sys.stdout.flush()
             return code
