@@ -16,6 +16,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from agentspec import __version__
 from agentspec.state import write_atomic
 from agentspec.tokens import shared_prefix
 from agentspec.types import (
@@ -122,8 +123,8 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    found = {}
-    for name in ("agentspec", "gymnasium", "numpy", "torch", "transformers"):
+    found = {"agentspec": __version__}
+    for name in ("gymnasium", "numpy", "torch", "transformers"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

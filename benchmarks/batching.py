@@ -117,7 +117,7 @@ def _same(written: list[Any], expected: list[Any]) -> float:
 
 def main() -> None:
     """Both parts; a table or JSON."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--model", default="smollm2-135m", help="`tiny`: a random one, for a try")
     parser.add_argument("--rollouts", type=int, default=8, help="episodes, in groups of four")
     parser.add_argument("--turns", type=int, default=6)

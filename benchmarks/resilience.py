@@ -34,7 +34,7 @@ GROUP = 4
 
 def main() -> None:
     """Both parts; a summary or JSON."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--steps", type=int, default=6)
     parser.add_argument("--episodes", type=int, default=200)
@@ -63,9 +63,10 @@ def main() -> None:
 def run_child(config: str) -> None:
     """Train as the recipe does, from the last complete checkpoint if there is one."""
     import benchmarks.market  # noqa: F401  (registers the world)
-    from recipes.common import parse_config, train
+    from trainers.arguments import parse_config
+    from trainers.run import train
 
-    train(parse_config(["--config", config]))
+    train(parse_config([], default=config))
 
 
 def write_model(folder: Path) -> Path:

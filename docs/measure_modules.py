@@ -83,7 +83,7 @@ def with_rows(page: str, rows: dict[str, str]) -> str:
 
 def main() -> None:
     """Measure the methods named (all by default); each row is written as soon as it is known."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("method", nargs="*")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--model", default="smollm2-135m")

@@ -44,8 +44,8 @@ class Receipt:
     tokens: int = 0
     trained: int = 0
     denominator: int = 0
-    blank_rows: int = 0
-    silent_rows: int = 0
+    padding_rows: int = 0
+    zero_gradient_rows: int = 0
     by_tag: dict[str, int] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
 
@@ -54,7 +54,7 @@ class Receipt:
         tags = ", ".join(f"{tag} {count}" for tag, count in sorted(self.by_tag.items())) or "none"
         head = (
             f"update {self.round}: {self.episodes} episodes ({self.unscorable} unscorable) -> {self.rows} rows "
-            f"({self.silent_rows} without gradient, {self.blank_rows} blank), {self.tokens} tokens, "
+            f"({self.zero_gradient_rows} without gradient, {self.padding_rows} of padding), {self.tokens} tokens, "
             f"{self.trained} trained = denominator {self.denominator}; trained by call: {tags}"
         )
         return [head, *(f"  VIOLATION {v}" for v in self.violations)]
@@ -121,7 +121,7 @@ def _manifest(path: Path) -> dict[str, Any]:
 
 
 def _audit_update(folder: Path, record: dict[str, Any], rule: CreditRule) -> Receipt:
-    receipt = Receipt(record["round"], denominator=record["denominator"], blank_rows=record["blank_rows"])
+    receipt = Receipt(record["round"], denominator=record["denominator"], padding_rows=record["padding_rows"])
     files = sorted((folder / "trajectories").glob(f"{record['round']:06d}*.jsonl"))
     if not files:
         receipt.violations.append(f"the episodes of this update are missing ({folder}/trajectories)")
@@ -140,7 +140,7 @@ def _audit_update(folder: Path, record: dict[str, Any], rule: CreditRule) -> Rec
     for row in credited.rows:
         _check_tokens(row.sequence, episodes[row.episode], receipt)
     receipt.rows = len(credited.rows)
-    receipt.silent_rows = sum(r.zero_gradient for r in credited.rows)
+    receipt.zero_gradient_rows = sum(r.zero_gradient for r in credited.rows)
     receipt.tokens = sum(len(r.sequence) for r in credited.rows)
     receipt.trained = sum(r.sequence.trained for r in credited.rows)
     if receipt.trained != receipt.denominator:
@@ -216,7 +216,7 @@ def _check_advantages(rows: Sequence[Row], episodes: Sequence[Trajectory], rule:
     size = rule.group
     for start in range(0, len(episodes), size):
         members = [i for i in range(start, start + size) if episodes[i].scorable]
-        if all(i in values for i in members):  # masked or silent members have no rows to sum over
+        if all(i in values for i in members):  # masked members have no rows to sum over
             total = math.fsum(values[i] for i in members)
             if abs(total) > TOLERANCE * max(1, size):
                 receipt.violations.append(f"advantages of group {start // size} sum to {total:.2g}, not 0")

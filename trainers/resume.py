@@ -24,7 +24,7 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.registry import SpecError
 from agentspec.state import write_atomic
-from trainers.batches import ROWS
+from trainers.micro_batches import ROWS
 from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
         "format": FORMAT,
         "step": state.step,
         "round": state.round,
-        "buffered": [[_row_to_json(r) for r in hand] for hand in state.buffered],
+        "buffered": [[_row_to_json(r) for r in rows] for rows in state.buffered],
         "memory": None if state.memory is None else base64.b64encode(state.memory).decode(),
     }
     write_atomic(Path(folder) / _name(rank), json.dumps(data))
@@ -232,6 +232,6 @@ class ExactResume(Base):
             return
         self._step, self._round, self._memory = state.step, state.round, state.memory
         if state.buffered:
-            self._buffered_inputs = self._collated([list(hand) for hand in state.buffered])
+            self._buffered_inputs = self._collated([list(rows) for rows in state.buffered])
         if self.accelerator.is_main_process:
             rewind_logs(self.run_log, self.state.global_step)

@@ -9,38 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
-
-from agentspec.registry import SpecError
-
-if TYPE_CHECKING:
-    from trainers.config import ScaffoldConfig
-
-TOKEN_MODES = ("token_truncate", "token_mask")
-
-
-def check_vllm(config: ScaffoldConfig) -> None:
-    """Refuse what TRL offers for whole rows, or for all ranks at once.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to set.
-    """
-    if not config.use_vllm:
-        return
-    if config.vllm_mode == "colocate" and config.vllm_tensor_parallel_size != 1:
-        raise SpecError(
-            f"vllm_tensor_parallel_size is {config.vllm_tensor_parallel_size} with vllm_mode colocate: its engine "
-            "needs the same requests at the same moment on several processes, but each plays episodes of its own; use "
-            "1, or vllm_mode: server (`vllm serve --tensor-parallel-size ...`)"
-        )
-    if config.vllm_importance_sampling_correction and config.vllm_importance_sampling_mode not in TOKEN_MODES:
-        raise SpecError(
-            f"vllm_importance_sampling_mode {config.vllm_importance_sampling_mode!r} speaks of rows, and an episode "
-            f"may have several; use one of {', '.join(TOKEN_MODES)}"
-        )
 
 
 @contextmanager

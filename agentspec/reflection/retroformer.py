@@ -12,7 +12,7 @@ followed by a trial of their own, so their rewards compare like with like.
 
 ``when`` says in which of the two trials the lesson is written: at the ``end`` of the failed one, or at the ``start`` of
 the next. What the reflector reads is the same. With ``start`` a lesson and the trial that pays it are one episode, so
-that many lessons can be drawn from the memory that one failed trial left: :mod:`trainers.retroformer` trains on these.
+that many lessons can be drawn from the memory that one failed trial left: a trainer may learn from these.
 """
 
 from __future__ import annotations

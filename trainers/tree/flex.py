@@ -3,7 +3,7 @@
 Nodes are packed parents first, each subtree in one piece. So token j is on the path of token i exactly if
 ``j <= i < end(j)``, where ``end(j)`` is the place after the last token below j: one integer per token says it all, and
 FlexAttention (Dong et al., 2024) skips every block in which nobody sees anybody. On a CPU, where it has no backward
-pass, attention goes node by node (:func:`trainers.tree.tree_attention`).
+pass, attention goes node by node (:func:`trainers.tree.attention.tree_attention`).
 """
 
 from __future__ import annotations
