@@ -20,9 +20,11 @@ from trl import GRPOTrainer
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.progress import episode_progress
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
+from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
@@ -42,7 +44,7 @@ from trainers.validation import validate, validation_scaffolds
 from trainers.vllm import vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, PolicyLoss, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -144,6 +146,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, PolicyLoss, GRPOTrainer):
             make_env=self._make_env,
             concurrency=self.args.rollout_concurrency or None,
             timeout_s=self.args.env_timeout_s,
+            progress=episode_progress if self.accelerator.is_main_process else None,
             policy=f"step-{self.state.global_step}",
         )
 

@@ -23,8 +23,8 @@ def test_generated_tables_are_current(name: str) -> None:
     assert script.updated(page) == page, f"run `python docs/update_{name}.py`"
 
 
-@pytest.mark.parametrize("kind", ["reasoning", "reflection"])
+@pytest.mark.parametrize("kind", ["memory", "reasoning", "reflection"])
 def test_every_method_has_a_paragraph(kind: str) -> None:
     page = (DOCS / "modules.md").read_text(encoding="utf-8")
-    for name, entry in REGISTRY.entries[kind].items():
+    for name, entry in REGISTRY.all(kind).items():
         assert f"**`{name}`**" in page or entry.envs or name == "none", f"docs/modules.md says nothing about {name}"
