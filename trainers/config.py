@@ -47,7 +47,7 @@ class ScaffoldConfig(GRPOConfig):
         estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
-        skip_zero_variance: leave groups whose returns are all equal out of the loss denominator too.
+        skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
         normalize: ``token`` weighs every trained token alike (an episode that trains more tokens counts more);
             ``rollout`` weighs every rollout alike, so that call-heavy scaffolds do not inflate the loss.
         overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
