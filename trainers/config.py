@@ -74,8 +74,9 @@ class ScaffoldConfig(GRPOConfig):
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: ``ordered`` and ``closed`` repeat to the
-            last bit, ``eager`` waits for nobody, ``auto`` does so where it repeats (:mod:`agentspec.llm.batching`).
+        batching: when the local backend takes requests into a running batch: ``continuous`` at any time, ``closed``
+            never, so that runs repeat on every device; ``auto`` is ``continuous`` where that repeats to the last bit
+            (a CPU in float32), else ``closed``, with a warning (`agentspec.llm.batching`).
         packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
@@ -119,7 +120,7 @@ class ScaffoldConfig(GRPOConfig):
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    batching: str = field(default="auto", metadata={"help": "auto, ordered, closed or eager"})
+    batching: str = field(default="auto", metadata={"help": "auto, continuous or closed"})
     packing: str = field(default="tree", metadata={"help": "tree or padded"})
     tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
     lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
