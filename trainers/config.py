@@ -85,6 +85,8 @@ class ScaffoldConfig(GRPOConfig):
         vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
             trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
             (``token_mask``); both need ``vllm_importance_sampling_correction``.
+        vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
+            runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
@@ -129,6 +131,7 @@ class ScaffoldConfig(GRPOConfig):
     vllm_importance_sampling_mode: str = field(
         default="token_truncate", metadata={"help": "token_truncate or token_mask"}
     )
+    vllm_batch_invariant: bool = field(default=False, metadata={"help": "vLLM's batch-invariant mode"})
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})

@@ -33,7 +33,7 @@ from trainers.rollouts import collect, rollout_jobs, task_of
 from trainers.runlog import RunLog, transcript
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
-from trainers.vllm import importance_ratio, vllm_round
+from trainers.vllm import importance_ratio, prepare_vllm, vllm_round
 
 
 class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
@@ -58,6 +58,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         **kwargs: Any,
     ) -> None:
         args.check()
+        prepare_vllm(args)
         self.rewards_used = args.reward_set
         self.credit_rule = CreditRule.from_config(args)
         self._played: list[ScoredEpisode] = []
