@@ -165,7 +165,7 @@ def _one(pack: Pack, segment: Segment, layer: int, query: torch.Tensor, scores: 
     rows = _query_rows(groups * n, query.device)
     q = query.reshape(1, kv_heads, groups * n, -1)
     if rows > groups * n:
-        q = torch.cat([q, q.new_zeros(1, kv_heads, rows - groups * n, q.shape[3])], 2)
+        q = torch.nn.functional.pad(q, (0, 0, 0, rows - groups * n))
     mask = _causal_mask(pack, n, total, padded, groups, rows, scores.window, q)
     o = _attend(q, keys, values, mask, groups, n, scores)[:, :, : groups * n]
     return o.reshape(-1, n, o.shape[-1])[:heads].transpose(0, 1)

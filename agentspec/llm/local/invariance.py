@@ -68,7 +68,7 @@ class InvariantModules:
         try:
             if _packs() and next(self._model.parameters()).device.type == "cpu":
                 for module, forward in self._replacements():
-                    module.forward = forward  # type: ignore[method-assign]
+                    module.forward = forward
                     replaced.append(module)
             yield
         finally:
