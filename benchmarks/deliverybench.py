@@ -35,7 +35,7 @@ from agentspec.envs.deliverybench.city.citymap import forget_cities
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe
-from agentspec.envs.deliverybench.view.observation import around, full_text
+from agentspec.envs.deliverybench.view.full import around, full_text
 from agentspec.envs.deliverybench.world.engine import World
 
 REFERENCE_MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "deliverybench" / "maps"

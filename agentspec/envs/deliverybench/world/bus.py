@@ -21,6 +21,9 @@ from agentspec.envs.deliverybench.world.rules import Rules
 
 Point = tuple[float, float]
 
+_extending = threading.Lock()
+"""Held while a timetable grows; not a timetable's own, so that worlds can be copied and pickled."""
+
 
 @dataclass(frozen=True, slots=True)
 class BusPhase:
@@ -76,11 +79,14 @@ class BusTimetable:
         self._line = Line(names, stops, points, at)
         self._cursor = 0
         self._direction = 1
-        self._lock = threading.Lock()
         self._ticks: list[int] = []
         self._phases: list[BusPhase] = []
         if stops:
             self._drive(0, points[0], 0, "", -1)
+
+    def __deepcopy__(self, memo: object) -> BusTimetable:
+        """Itself: a timetable is a function of the clock, and copies of a world share it."""
+        return self
 
     def phase(self, tick: int) -> BusPhase | None:
         """The phase at ``tick``; None for a city without a bus."""
@@ -107,7 +113,7 @@ class BusTimetable:
         """Compute phases until one begins after ``tick``; worlds in several threads may share the timetable."""
         if self._ticks[-1] > tick:
             return
-        with self._lock:
+        with _extending:
             while self._ticks[-1] <= tick:
                 self._next()
 
