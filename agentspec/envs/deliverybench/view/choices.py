@@ -7,8 +7,10 @@ choice, and as numbers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 from agentspec.envs.deliverybench.view import calls
 from agentspec.envs.deliverybench.view.calls import Card, View, within_reach
@@ -37,6 +39,9 @@ MAX_ORDERS = 8
 LEVELS = (80.0, 100.0, 60.0, 40.0)
 DRINK, PACK, ICE, HEAT = "energy_drink", "escooter_battery_pack", "ice_pack", "heat_pack"
 GOODS: Mapping[str, str] = {DRINK: "energy drink", PACK: "battery pack", ICE: "ice pack", HEAT: "heat pack"}
+PARTNERS = 6
+"""How many of the best offers are tried as the second of a pair."""
+
 SHORT_WAIT_S, LONG_WAIT_S = 60.0, 300.0
 
 
@@ -136,9 +141,9 @@ def open_stops(view: View) -> list[Sequence[float]]:
 
 def rate(offer: Card, anchors: Sequence[Sequence[float]]) -> float:
     """Dollars per metre that an offer adds to a round through `anchors` (the courier first)."""
-    to_pickup = min(calls.distance(anchor, offer["pickup_xy"]) for anchor in anchors)
-    onward = [offer["pickup_xy"], *anchors[1:]]
-    to_dropoff = min(calls.distance(anchor, offer["dropoff_xy"]) for anchor in onward)
+    pickup, dropoff = offer["pickup_xy"], offer["dropoff_xy"]
+    to_pickup = min(map(math.dist, anchors, repeat(pickup)))
+    to_dropoff = min(map(math.dist, (pickup, *anchors[1:]), repeat(dropoff)))
     return float((offer["pay"] + 2.0) / (to_pickup + to_dropoff + 100.0))
 
 
@@ -160,7 +165,7 @@ def offers(view: View) -> list[Option]:
     if room > 1 and len(best) > 1:
         first = best[0]
         anchors = [view["position"], *open_stops(view), first["pickup_xy"], first["dropoff_xy"]]
-        second = max(best[1:], key=lambda offer: (rate(offer, anchors), -offer["id"]))
+        second = max(best[1:PARTNERS], key=lambda offer: (rate(offer, anchors), -offer["id"]))
         ids, pay = [first["id"], second["id"]], first["pay"] + second["pay"]
         text = f"accept orders {ids[0]}, {ids[1]}"
         found.insert(1, Option(text, calls.accept(ids), "accept", f"${pay:.1f}", dollars=pay))
