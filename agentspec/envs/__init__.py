@@ -1,8 +1,17 @@
-"""The environments: each a versioned `gymnasium.Env`, registered when this package is imported."""
+"""The environments: each a versioned `gymnasium.Env`, registered when this package is imported.
+
+What an environment owes the scaffold stands in `agentspec.envs.contract`; `check_environment` holds one against it.
+"""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
+
+if TYPE_CHECKING:
+    from agentspec.envs.contract import ContractError, check_environment
+    from agentspec.envs.making import environment_id, make_env
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
@@ -13,6 +22,23 @@ ENTRY_POINTS = {
 STEP_LIMITS = {"agentspec/DeliveryBench-v0": 5000, "agentspec/DeliveryBenchDiscrete-v0": 5000}
 """Environment id -> steps after which every episode is cut."""
 
+_PUBLIC = {
+    "ContractError": "agentspec.envs.contract",
+    "check_environment": "agentspec.envs.contract",
+    "environment_id": "agentspec.envs.making",
+    "make_env": "agentspec.envs.making",
+}
+
+__all__ = [
+    "ENTRY_POINTS",
+    "STEP_LIMITS",
+    "ContractError",
+    "check_environment",
+    "environment_id",
+    "make_env",
+    "register_all",
+]
+
 
 def register_all() -> None:
     """Register every environment with gymnasium; registering again changes nothing."""
@@ -21,6 +47,15 @@ def register_all() -> None:
             # The passive checker would validate every observation of every step; the test suite checks them instead.
             limit = STEP_LIMITS.get(name)
             gymnasium.register(name, entry_point, max_episode_steps=limit, disable_env_checker=True)
+
+
+def __getattr__(name: str) -> Any:
+    """The public functions, imported when they are asked for: registering must stay cheap."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_PUBLIC[name]), name)
 
 
 register_all()

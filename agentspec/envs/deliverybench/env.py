@@ -39,6 +39,7 @@ from agentspec.envs.deliverybench.world.events import Progress, events_since
 from agentspec.envs.deliverybench.world.grammar import advertised
 from agentspec.envs.deliverybench.world.rules import Rules, rules_named
 from agentspec.envs.deliverybench.world.thinking import ThinkTime
+from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema
 
 CHARSET = string.printable
@@ -79,7 +80,20 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         ValueError: an argument that is none of these.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+        "metrics": (
+            Metric(
+                "hourly_profit",
+                "$/h",
+                summary="growth of the balance per hour of the shift (of the time played if cut)",
+            ),
+            Metric("net_earnings", "$", summary="growth of the balance"),
+            Metric("deliveries", summary="orders delivered"),
+        ),
+        "typical_return": 50.0,
+    }
     experts: ClassVar[dict[str, str]] = {
         "rule_based": "agentspec.envs.deliverybench.expert.scripted:expert",
         "random": "agentspec.envs.deliverybench.expert.scripted:luck",
