@@ -43,11 +43,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One argument of an action: its type name, whether it must be given, and the allowed values if they are few."""
+    """One argument of an action: its type name, whether it must be given, and the allowed values if they are few.
+
+    Args:
+        default: what leaving it out means (`None`: nothing in particular).
+        resolution: smallest difference that matters to the environment, in the schema's base unit (0: all do).
+    """
 
     type: Literal["int", "float", "str", "list", "any"] = "any"
     required: bool = True
     enum: tuple[str, ...] = ()
+    default: Any = None
+    resolution: float = 0.0
 
 
 @dataclass(frozen=True)
