@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
+from agentspec.declaration import Declaration
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
@@ -21,6 +22,11 @@ class BaseMemory:
     Args:
         window: steps kept.
     """
+
+    declaration = Declaration(
+        "rolling buffer of the most recent steps",
+        aliases=("simple",),
+    )
 
     def __init__(self, services: Services, window: int = 5) -> None:
         if window < 1:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from agentspec.declaration import Declaration
 from agentspec.types import AgentInput, Task
 
 NEEDED = ("instruction", "action_schema", "state")
@@ -20,6 +21,8 @@ class GenericPerception:
     Args:
         images: pass the observation's `image` on, for models that see.
     """
+
+    declaration = Declaration("image, instruction, state and action schema of any environment that keeps the contract")
 
     def __init__(self, images: bool = False) -> None:
         self.images = images

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.actions import parse_action
 from agentspec.protocols import Services
 from agentspec.reasoning.common import ask_action, default_answer, last_action_line, sampled, static_prompt, user_turn
@@ -38,6 +39,12 @@ class ReAct:
         thought_tokens: most tokens of a thought (``None``: the spec's ``max_tokens``).
         history: steps of transcript shown in the ``snapshot`` layout.
     """
+
+    declaration = Declaration(
+        "a growing transcript of thought, action and observation",
+        calls=CallProfile(step=(1, 11)),
+        purposes={"think": Purpose("step"), "act": Purpose("step")},
+    )
 
     def __init__(
         self,
