@@ -62,6 +62,7 @@ class Declaration:
         envs: registered environments the method is written for; empty: any.
         small: parameters under which everything the method does fires within a dozen steps; for tests.
         small_calls: the call profile under `small`; `None`: as `calls`.
+        scope: `run` for a method that is of no use within one episode: a spec with another scope is refused.
         name: name in a spec; empty: the name of the file in this package, outside it the class's name in snake case.
         aliases: other names.
     """
@@ -75,6 +76,7 @@ class Declaration:
     envs: tuple[str, ...] = ()
     small: Mapping[str, Any] = field(default_factory=dict)
     small_calls: CallProfile | None = None
+    scope: str = ""
     name: str = ""
     aliases: tuple[str, ...] = ()
 

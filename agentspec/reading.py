@@ -34,7 +34,7 @@ _TOKEN = re.compile(r"<\|[^<>|]{1,40}\|>|</s>|<end_of_turn>|<eos>")
 _AS_LABEL = re.compile(r"<(action|answer|final_answer|command)>(.*?)(?:</\1>|$)", re.IGNORECASE | re.DOTALL)
 _BOXED = re.compile(r"\\boxed\{([^{}]*)\}")
 _SIGNS = str.maketrans(
-    {"“": '"', "”": '"', "‘": "'", "’": "'", "（": "(", "）": ")", "：": ":", "−": "-", "\u00a0": " ", "\u200b": ""}  # noqa: RUF001
+    {"“": '"', "”": '"', "‘": "'", "’": "'", "（": "(", "）": ")", "：": ":", "−": "-", "\u00a0": " ", "\u200b": ""}
 )
 
 _LABEL = re.compile(
@@ -47,7 +47,9 @@ _LABEL = re.compile(
 _HEADING = re.compile(r"^[ \t]*#+[ \t]*(?:final |next )?action[ \t:]*$", re.IGNORECASE | re.MULTILINE)
 _MID_LABEL = re.compile(r"\b(?:final |next )?action[ \t*_`]*:", re.IGNORECASE)
 _INPUT = re.compile(r"^[ \t*_`]*(?:action[ \t_]*input|arguments|args|parameters|input)[ \t*_`]*:[ \t*_`]*", re.I | re.M)
-_TURN = re.compile(r"^\W{0,4}(?:observation|user|human|environment|system|result)[ \t]*\d*[ \t*_]*:", re.I | re.MULTILINE)
+_TURN = re.compile(
+    r"^\W{0,4}(?:observation|user|human|environment|system|result)[ \t]*\d*[ \t*_]*:", re.I | re.MULTILINE
+)
 _THOUGHT = re.compile(r"^[ \t>#*_\-]*(?:thoughts?|reasoning|plan|analysis|rationale)[ \t]*\d*[ \t*_]*:", re.IGNORECASE)
 _FENCE = re.compile(r"^[ \t]*(?:```|~~~)[\w+\-]*[ \t]*", re.MULTILINE)
 _DRESS = re.compile(r"^(?:(?:```|~~~)[\w+\-]*\s|[\s>#*_`~\"'•\-]|\(?\d{1,2}[.):](?=\s))+")
@@ -57,10 +59,12 @@ _SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]*\(")
 _SQUARE = re.compile(r"([A-Za-z_][\w.\-]*)[ \t]*\[")
 _WORD = re.compile(r"[A-Za-z_][\w\-]*")
 _REMARK = re.compile(
-    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|because\b|since\b|as\b|to\b|so\b|in order\b|and\b|then\b|or\b|if\b|for\b)",  # noqa: RUF001
+    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|because\b|since\b|as\b|to\b|so\b|in order\b|and\b|then\b|or\b|if\b|for\b)",
     re.IGNORECASE,
 )
-_NEGATED = re.compile(r"(?:\bnot|n't|\bnever|\bavoid(?:ing)?|\binstead of|\brather than|\bwithout|\bcannot)\W+(?:\w+\W+)?$", re.I)
+_NEGATED = re.compile(
+    r"(?:\bnot|n't|\bnever|\bavoid(?:ing)?|\binstead of|\brather than|\bwithout|\bcannot)\W+(?:\w+\W+)?$", re.I
+)
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,9 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     if (cut or open_block) and error.code not in ("PARSE_UNKNOWN", "PARSE_ARGS"):
         message = "the answer was cut off before its action; write less, and the action first"
         error = ActionError("TRUNCATED", message, error.text)
-    return Reading(ActionError(error.code, error.message, _inert(error.text, schema)), reading.thought, reading.explicit)
+    return Reading(
+        ActionError(error.code, error.message, _inert(error.text, schema)), reading.thought, reading.explicit
+    )
 
 
 def _inert(text: str, schema: ActionSchema) -> str:
@@ -182,13 +188,13 @@ class _Reader:
 
     def _value(self, text: str) -> Action | ActionError | None:
         """The action at the beginning of what follows a label."""
-        text = _DRESS.sub("", text, count=1) if not text.lstrip()[:1] in ("{", "[") else text.lstrip()
+        text = _DRESS.sub("", text, count=1) if text.lstrip()[:1] not in ("{", "[") else text.lstrip()
         choice = self._choice_at(text)
         if choice is not None:
             return choice
         if text[:1] in ("{", "[", "<"):
             shape = shapes.find_shape(text, self.schema)
-            if shape is not None and not text[: shape.start].strip("[< \n\t") :
+            if shape is not None and not text[: shape.start].strip("[< \n\t"):
                 return self._value(shape.text)
         for pattern in (_CALL, _SPACED_CALL):
             match = pattern.match(text)
@@ -228,7 +234,11 @@ class _Reader:
             return None
         given = _INPUT.search(text, match.end())
         if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
-            value = _DRESS.sub("", text[given.end() :], count=1) if text[given.end() :][:1] not in "{[" else text[given.end() :]
+            value = (
+                _DRESS.sub("", text[given.end() :], count=1)
+                if text[given.end() :][:1] not in "{["
+                else text[given.end() :]
+            )
             data = shapes.find_shape('{"action": "%s", "args": ' % name + value.rstrip("`\n ") + "}", self.schema)
             line = _first_line(value).strip("`\"'* ")
             inner = data.text if data is not None else f"{name}({line})"
@@ -294,7 +304,11 @@ class _Reader:
             alone = _CALL.match(bare) is not None and not bare[whole.end :].strip(" \t\n`*.;\"'")
             return action if known or alone else None
         word = _WORD.match(bare)
-        if word is not None and known_name(word.group(), self.schema) and not _first_line(bare[word.end() :]).strip(" `*.;\"'"):
+        if (
+            word is not None
+            and known_name(word.group(), self.schema)
+            and not _first_line(bare[word.end() :]).strip(" `*.;\"'")
+        ):
             return self._bare(bare) if word.group().isupper() or "_" in word.group() else None
         square = _SQUARE.match(bare)
         known = square is not None and known_name(square.group(1), self.schema) is not None
@@ -319,7 +333,7 @@ class _Reader:
         action, start, end = found[-1]
         marked = text[start - 1 : start] in ("`", "*", '"', "'") and text[end : end + 1] in ("`", "*", '"', "'")
         closing = not text[end:].strip(" \t\n.!;:*`\"')]}")
-        return action if (marked or closing) and not _NEGATED.search(text[:start].rstrip("`*\"' ")+" ") else None
+        return action if (marked or closing) and not _NEGATED.search(text[:start].rstrip("`*\"' ") + " ") else None
 
     def _mentioned_choices(self, text: str) -> list[tuple[Action, int, int]]:
         """Menu entries in prose, the longest at each place."""

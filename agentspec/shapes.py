@@ -19,12 +19,24 @@ from agentspec.types import ActionSchema
 
 WRAPPERS = ("tool_calls", "tool_call", "function_call", "function", "call", "actions")
 NAMES = ("action", "action_call", "next_action", "final_action", "command", "tool", "tool_name", "action_name", "name")
-ARGUMENTS = ("args", "arguments", "parameters", "params", "kwargs", "tool_input", "action_input", "action_args", "input")
+ARGUMENTS = (
+    "args",
+    "arguments",
+    "parameters",
+    "params",
+    "kwargs",
+    "tool_input",
+    "action_input",
+    "action_args",
+    "input",
+)
 THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "analysis", "reason")
 MOST_OBJECTS = 16
 """Opening brackets that are tried before a text is taken to hold no data."""
 
-_FUNCTION = re.compile(r"<function=([\w.\-]+)>|<invoke\s+name=[\"']([\w.\-]+)[\"']\s*>|\bto=functions\.([\w\-]+)[^{}\n]*")
+_FUNCTION = re.compile(
+    r"<function=([\w.\-]+)>|<invoke\s+name=[\"']([\w.\-]+)[\"']\s*>|\bto=functions\.([\w\-]+)[^{}\n]*"
+)
 _PARAMETER = re.compile(
     r"<parameter(?:=([\w\-]+)|\s+name=[\"']([\w\-]+)[\"'])\s*>\s*(.*?)\s*</parameter>", re.DOTALL | re.IGNORECASE
 )
@@ -59,7 +71,7 @@ def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | No
     name = known_name(next(g for g in tag.groups() if g), schema)
     if name is None:
         return None
-    rest = text[tag.end() :].split("</function>")[0].split("</invoke>")[0]
+    rest = text[tag.end() :].split("</function>", maxsplit=1)[0].split("</invoke>", maxsplit=1)[0]
     kwargs: dict[str, Any] = {a or b: _scalar(value) for a, b, value in _PARAMETER.findall(rest)}
     brace = rest.find("{")
     data = _decode(rest, brace) if not kwargs and brace >= 0 else None

@@ -240,7 +240,7 @@ class Sampling:
     temperature: float = 1.0
     top_p: float = 1.0
     top_k: int = 0
-    max_tokens: int = 256
+    max_tokens: int = 1024
     stop: tuple[str, ...] = ()
     n: int = 1
     choices: tuple[str, ...] = ()

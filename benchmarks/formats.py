@@ -54,7 +54,9 @@ def _tagged(action: str) -> str:
     if not _keywords_only(action):
         return f"<action>{action}</action>"
     name, _, kwargs = parts(action)
-    values = "".join(f"<parameter={k}>\n{v if isinstance(v, str) else json.dumps(v)}\n</parameter>\n" for k, v in kwargs.items())
+    values = "".join(
+        f"<parameter={k}>\n{v if isinstance(v, str) else json.dumps(v)}\n</parameter>\n" for k, v in kwargs.items()
+    )
     return f"<tool_call>\n<function={name}>\n{values}</function>\n</tool_call>"
 
 
@@ -115,7 +117,9 @@ FORMATS: dict[str, Format] = {
     "json in prose": lambda a, d: f"Here is my decision: {json.dumps({'action': a})} I hope it pays.",
     "json with single quotes": lambda a, d: str({"action": a}),
     "json, name and args": lambda a, d: _named(a, "action", "args"),
-    "json, name and arguments": lambda a, d: _named(a, "name", "arguments") if "(" in a else _named(a, "action", "args"),
+    "json, name and arguments": lambda a, d: (
+        _named(a, "name", "arguments") if "(" in a else _named(a, "action", "args")
+    ),
     "json, tool and input": lambda a, d: _named(a, "tool", "tool_input", thought="this pays"),
     "json of the original benchmark": lambda a, d: json.dumps({"action": {"action_call": a}, "future_plan": "earn"}),
     "openai tool call": lambda a, d: _tool_call(a),
@@ -134,7 +138,9 @@ FORMATS: dict[str, Format] = {
         f"<|channel|>analysis<|message|>Action: {d}<|end|><|start|>assistant<|channel|>final<|message|>Action: {a}<|return|>"
     ),
     "special token": lambda a, d: f"{a}<|im_end|>",
-    "invented observation": lambda a, d: f"Thought: this pays\nAction: {a}\nObservation: done.\nThought: on\nAction: {d}",
+    "invented observation": lambda a, d: (
+        f"Thought: this pays\nAction: {a}\nObservation: done.\nThought: on\nAction: {d}"
+    ),
     "invented turn": lambda a, d: f"{a}\nObservation: done.\n{d}",
     "invented user": lambda a, d: f"Action: {a}\n\nUser: well done\n\nAssistant: Action: {d}",
     "two actions": lambda a, d: f"Action: {a}\nAction: {d}",

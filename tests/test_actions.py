@@ -131,7 +131,7 @@ def test_every_form_of_a_menu_entry_is_read(form: str, entry: str) -> None:
         ("Action: VIEW_ORDERS", "VIEW_ORDERS()"),
         ("ACCEPT_ORDER[3, 7]", "ACCEPT_ORDER([3, 7])"),
         ("functions.VIEW_ORDERS()", "VIEW_ORDERS()"),
-        ("MOVE(12m, −3m)", "MOVE(12m, -3m)"),  # noqa: RUF001
+        ("MOVE(12m, −3m)", "MOVE(12m, -3m)"),
         ('{"VIEW_ORDERS": {}}', "VIEW_ORDERS()"),
         ('{"action": "MOVE", "x": 12, "y": "3m"}', "MOVE(12, 3m)"),
         ('[{"name": "MOVE", "arguments": {"x": "1m", "y": "2m"}}, {"name": "VIEW_ORDERS"}]', "MOVE(1m, 2m)"),

@@ -12,8 +12,8 @@ import random
 from collections.abc import Mapping
 from typing import Any
 
-from agentspec.declaration import Declaration
 from agentspec.actions import parse_action
+from agentspec.declaration import Declaration
 from agentspec.envs.experts import NoPlayer, Player, player
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless

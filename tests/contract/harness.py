@@ -55,7 +55,13 @@ class Case:
         """An agent around the module; nothing else of it calls the model more than once."""
         params = {"preset": self.preset} if self.preset else {}
         return AgentSpec.from_data(
-            {"reasoning": "direct", self.kind: {"name": self.name, **params}, "layout": layout, **more}
+            {
+                "reasoning": "direct",
+                self.kind: {"name": self.name, **params},
+                "layout": layout,
+                "scope": self.entry.declaration.scope or "episode",
+                **more,
+            }
         )
 
     def __str__(self) -> str:
