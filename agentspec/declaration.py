@@ -1,8 +1,8 @@
 """What a module says about itself: what it costs, what it asks the model for, what it needs.
 
-The declaration stands on the class (`declaration = Declaration(...)`), so that a method is one file. Cost and capability
-are known from it before a run; the table in the documentation, `agentspec list`, the trainer's check of patterns and
-the contract tests read it. The contract tests hold it against what is really called.
+The declaration stands on the class (`declaration = Declaration(...)`), so that a method is one file. Cost and
+capability are known from it before a run; the table in the documentation, `agentspec list`, the trainer's check of
+patterns and the contract tests read it. The contract tests hold it against what is really called.
 """
 
 from __future__ import annotations
@@ -46,6 +46,11 @@ class Purpose:
 
     occasion: Occasion
     example: str = ""
+
+    @classmethod
+    def each(cls, occasion: Occasion, *names: str) -> dict[str, Purpose]:
+        """Purposes of one occasion that any text answers."""
+        return {name: cls(occasion) for name in names}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import math
 import queue
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from agentspec.agent import Agent
 from agentspec.envs import environment_id, make_env
 from agentspec.llm.base import LLM, ContextOverflowError, LLMError
+from agentspec.llm.helpers import helper
 from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
@@ -140,19 +141,24 @@ class Runner:
     async def run_async(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
-        self.spec.check(frozenset(llm.capabilities) | {"snapshots"}, f"backend {llm.name!r}")
+        self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
+        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items()}
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:
             async with gate:
-                trajectory = await self._episode(job, llm)
+                trajectory = await self._episode(job, llm, helpers)
             if self.on_done:
                 self.on_done(trajectory)
             return trajectory
 
         return list(await asyncio.gather(*(guarded(job) for job in jobs)))
 
-    async def _episode(self, job: Job, llm: LLM) -> Trajectory:
+    def _offered(self, llm: LLM) -> frozenset[str]:
+        """What modules may need and get: of the backend, and of the caller."""
+        return frozenset(llm.capabilities) | ({"embedder"} if self.embedder else frozenset())
+
+    async def _episode(self, job: Job, llm: LLM, helpers: Mapping[str, LLM]) -> Trajectory:
         name = f"{job.task.key}-{job.rollout}-{job.seed:x}"
         recorder = Recorder(
             llm,
@@ -161,6 +167,7 @@ class Runner:
             sampling=self.spec.sampling,
             budget=self.spec.budget,
             prices=self.prices,
+            helpers=helpers,
         )
         agent = self.spec.build(recorder, embedder=self.embedder)
         worker = EnvWorker(self.timeout_s)
@@ -168,7 +175,9 @@ class Runner:
         try:
             return await self._play(job, agent, worker)
         finally:
-            llm.leave(name)
+            # Episodes never enter at a helper: it waits for nobody, and nobody waits for it.
+            for backend in (llm, *helpers.values()):
+                backend.leave(name)
             worker.close()
 
     async def _play(self, job: Job, agent: Agent, worker: EnvWorker) -> Trajectory:
@@ -183,7 +192,7 @@ class Runner:
             simulator = simulator_of(env, worker, job.task, agent.perception)
             if simulator is None:
                 who = f"environment {job.task.env!r} without snapshot() and restore()"
-                self.spec.check(frozenset(agent.recorder.llm.capabilities), who)
+                self.spec.check(self._offered(agent.recorder.llm), who)
             agent.attach_simulator(simulator)
             observation, info = await worker.call("reset", lambda: env.reset(seed=job.task.seed))
             agent.begin_episode(job.task)

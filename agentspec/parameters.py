@@ -86,7 +86,7 @@ def check_types(where: str, annotated: Any, values: Mapping[str, Any]) -> None:
             raise SpecError(f"{where}: {name} must be {_named(hints[name])}, got {value!r}")
 
 
-def fits(value: Any, kind: Any) -> bool:
+def fits(value: Any, kind: Any) -> bool:  # noqa: PLR0911  # one line per type
     """Whether a value read from YAML is of a type; types that YAML cannot express are taken on trust.
 
     >>> fits(3, float), fits(True, int), fits([1, "a"], list[int]), fits(None, int | None)

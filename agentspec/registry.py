@@ -232,7 +232,8 @@ class Registry:
         except Exception as error:
             source = point.dist.name if point.dist else "a distribution"
             raise SpecError(
-                f"entry point {point.name!r} ({point.value}) of {source} cannot be loaded: {error}; reinstall or remove it"
+                f"entry point {point.name!r} ({point.value}) of {source} cannot be loaded: {error}; reinstall or "
+                "remove it"
             ) from error
         if isinstance(loaded, ModuleType):
             self.add_module(loaded)
@@ -286,7 +287,8 @@ def _import_file(path: Path) -> ModuleType:
     loaded = sys.modules.get(path.stem)
     if loaded is not None and getattr(loaded, "__file__", None) == str(path.resolve()):
         return loaded
-    if loaded is not None or importlib.util.find_spec(path.stem) is not None:
+    found = importlib.util.find_spec(path.stem)
+    if loaded is not None or (found is not None and found.origin != str(path.resolve())):
         raise SpecError(f"{path} would hide the module {path.stem!r} that exists already; rename the file")
     location = importlib.util.spec_from_file_location(path.stem, path.resolve())
     assert location is not None and location.loader is not None
@@ -330,7 +332,8 @@ def _from_path(kind: str, name: str) -> Entry:
     module, _, attribute = name.partition(":")
     cls = getattr(_import(module), attribute, None)
     if not inspect.isclass(cls):
-        names = [v.__name__ for v in vars(sys.modules[module]).values() if inspect.isclass(v)]
+        classes = [v for v in vars(sys.modules[module]).values() if inspect.isclass(v)]
+        names = [c.__name__ for c in classes if c.__module__ == module]
         raise SpecError(f"{kind} {name!r}: module {module!r} has no class {attribute!r}{suggest(attribute, names)}")
     if kind_of(cls) != kind:
         raise SpecError(f"{name} is a {kind_of(cls)} module; the spec names it as {kind}")

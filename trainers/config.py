@@ -301,11 +301,10 @@ def call_paths(spec: AgentSpec) -> list[str]:
     """``module/...`` paths of the modules that may call the model, for checking patterns before a run."""
     paths = []
     for kind in MODULE_KINDS:
-        name = getattr(spec, kind).name
-        calls = REGISTRY.get(kind, name).calls
-        if any(most > 0 for _, most in (calls.retrieve, calls.store, calls.step, calls.episode)):
-            purposes = REGISTRY.get(kind, name).purposes or ("*",)
-            paths += [f"{kind}.{name}/{purpose}" for purpose in purposes]
+        module = getattr(spec, kind)
+        entry = REGISTRY.get(kind, module.name)
+        if entry.calls.calls_model:
+            paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
     return paths
 
 

@@ -45,7 +45,7 @@ class ChainOfThought(Stateless):
     declaration = Declaration(
         "thinks step by step, then acts; the chain is not carried on",
         calls=CallProfile(step=(1, 4)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
     )
 
     def __init__(

@@ -24,7 +24,7 @@ class Direct(Stateless):
     declaration = Declaration(
         "answers with the action only",
         calls=CallProfile(step=(1, 3)),
-        purposes={"act": Purpose("step")},
+        purposes=Purpose.each("step", "act"),
     )
 
     def __init__(self, services: Services, max_retries: int = MAX_RETRIES) -> None:

@@ -114,12 +114,7 @@ class LanguageAgentTreeSearch:
         "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
         calls=CallProfile(step=(1, 1123)),
         rl=CallProfile(step=(1, 22)),
-        purposes={
-            "propose": Purpose("step"),
-            "value": Purpose("step"),
-            "reflect": Purpose("step"),
-            "world": Purpose("step"),
-        },
+        purposes=Purpose.each("step", "propose", "value", "reflect", "world"),
         needs=("n", "snapshots"),
         waived={"snapshots": ("world", "model")},
     )

@@ -88,7 +88,7 @@ class MultiAgentDebate(Stateless):
         "agents answer, read each other's answers, answer again, and vote",
         calls=CallProfile(step=(9, 20)),
         rl=CallProfile(step=(4, 6)),
-        purposes={"argue": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "argue", "act"),
     )
 
     def __init__(

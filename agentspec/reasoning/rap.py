@@ -160,7 +160,7 @@ class ReasoningViaPlanning(Stateless):
         "Monte-Carlo tree search with the model as world model and judge",
         calls=CallProfile(step=(1, 93)),
         rl=CallProfile(step=(1, 18)),
-        purposes={"propose": Purpose("step"), "world": Purpose("step"), "judge": Purpose("step")},
+        purposes=Purpose.each("step", "propose", "world", "judge"),
         needs=("n", "score"),
         waived={"score": ("evaluation", "samples")},
     )

@@ -58,7 +58,7 @@ class ReAct:
     declaration = Declaration(
         "a growing transcript of thought, action and observation",
         calls=CallProfile(step=(1, 13)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
     )
 
     def __init__(

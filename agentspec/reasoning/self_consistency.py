@@ -85,7 +85,7 @@ class SelfConsistency(Stateless):
         "independent chains of thought, and a vote over their actions",
         calls=CallProfile(step=(1, 8)),
         rl=CallProfile(step=(1, 6)),
-        purposes={"think": Purpose("step"), "act": Purpose("step")},
+        purposes=Purpose.each("step", "think", "act"),
         needs=("n",),
     )
 

@@ -118,7 +118,7 @@ class TreeOfThoughts(Stateless):
         "a tree of short action sequences: propose, judge, prune, breadth or depth first",
         calls=CallProfile(step=(1, 22)),
         rl=CallProfile(step=(1, 10)),
-        purposes={"propose": Purpose("step"), "value": Purpose("step"), "vote": Purpose("step")},
+        purposes=Purpose.each("step", "propose", "value", "vote"),
         needs=("n",),
     )
 

@@ -83,7 +83,7 @@ class SelfRefine:
         "a critic's feedback on the action before it is executed, and another attempt, until it is content",
         calls=CallProfile(step=(1, 6)),
         rl=CallProfile(step=(1, 2)),
-        purposes={"feedback": Purpose("step"), "refine": Purpose("step")},
+        purposes=Purpose.each("step", "feedback", "refine"),
     )
 
     def __init__(

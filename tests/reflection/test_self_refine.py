@@ -104,7 +104,7 @@ GIVES_UP = {**spec(), "reasoning": {"name": "direct", "max_retries": 0}}
 
 def test_an_illegal_first_action_is_repaired() -> None:
     trajectory, requests = play(
-        scripted(["Verdict: change\nJUMP is unknown", "Verdict: keep"], ["SUB()"], "JUMP()"), spec(), steps=1
+        scripted(["Verdict: change\nJUMP is unknown", "Verdict: keep"], ["SUB()"], "JUMP()"), GIVES_UP, steps=1
     )
     assert "there is no action JUMP" in last(requests[1])
     assert trajectory.transitions[0].decision.valid and trajectory.metrics["invalid_actions"] == 0
