@@ -105,6 +105,12 @@ def visible(text: str) -> tuple[str, bool]:
     return _TOKEN.sub("", "".join(kept)).strip(), depth > 0
 
 
+def labelled(line: str) -> bool:
+    """Whether a line says `Action:` and what."""
+    label = _LABEL.match(line)
+    return label is not None and bool(line[label.end() :].strip(" `*"))
+
+
 def _plain(text: str) -> str:
     """Signs and marks of prose made plain: curly quotes, escaped underscores, tags and boxes around an answer."""
     text = text.translate(_SIGNS).replace("\\_", "_")

@@ -8,7 +8,7 @@ returns, lazy states, simulation by fast reward, back-propagation; the answer is
 
 The paper's problems are puzzles whose paths are equally long and pay only at the goal. For agents three things differ.
 Ending earns nothing by itself: a sum of negative log-probabilities would reward the path that dies first, so an end
-without the goal is charged for the steps that were left as well, at its own rate. What the world model says a step earns
+without the goal is charged, at its own rate, for the steps that were left and one more. What the world model says a step earns
 (in the environment's unit, divided by the environment's `typical_return`) enters as a share of the goal's reward. And with
 `reward="normalised"` (preset `rl`) log p(action) is taken per token, so that long calls are not the worse ones for their
 length. With `reward="paper"` and a model that predicts no earnings the numbers are the paper's.
@@ -75,8 +75,8 @@ class ImaginedProblem:
         node.state, node.terminal = outcome, outcome.ended
         steps = 1
         if outcome.ended and not outcome.reward:
-            # Ending earns nothing by itself: the steps that were left cost what this one does.
-            steps += max(0, method.depth - node.depth)
+            # Ending earns nothing by itself: the steps that were left, and one more, cost what this one does.
+            steps += max(0, method.depth - node.depth) + 1
         earned = outcome.reward or outcome.earned / method.scale
         node.reward = steps * min(0.0, node.prior) + max(0.0, node.prior)
         node.reward += (1 - method.alpha) * method.goal_reward * earned

@@ -10,7 +10,7 @@ from typing import Any
 from agentspec.actions import canonical, parse_action
 from agentspec.llm.base import Message
 from agentspec.prompting import with_request
-from agentspec.reading import read, visible
+from agentspec.reading import labelled, read, visible
 from agentspec.reasoning.search.meter import Meter
 from agentspec.types import Action, ActionSchema, LLMCall
 
@@ -52,10 +52,12 @@ def read_step(
 def read_steps(text: str, schema: ActionSchema, *, imagined: bool) -> list[str]:
     """The steps listed in `text`, one a line in whatever dress, equal ones once.
 
-    An answer that is no list of lines may still be one action (JSON, a label and its call on the next line).
+    Lines with an `Action:` label count alone where there are any. An answer that is no list of lines may still be one
+    action (JSON, a label and its call on the next line).
     """
     found: dict[Hashable, str] = {}
-    for line in visible(text)[0].splitlines():
+    lines = visible(text)[0].splitlines()
+    for line in [line for line in lines if labelled(line)] or lines:
         bare = _BULLET.sub("", line, count=1)
         step = read_step(bare, schema, imagined=imagined) if bare.strip("` \t") else None
         if step is not None:
