@@ -60,7 +60,7 @@ def test_a_quotation_keeps_the_action_whatever_is_cut() -> None:
 
 def test_advisers_see_each_others_actions_whatever_the_length() -> None:
     def wordy(request: Request) -> str:
-        return f"{'because of this and that, ' * 60}\nAction: {('ADD', 'SUB', 'DOUBLE')[request.id % 3]}()"
+        return f"{'because of this and that, ' * 30}\nAction: {('ADD', 'SUB', 'DOUBLE')[request.id % 3]}()"
 
     _, requests = play(wordy, {"reasoning": "mad"}, steps=1)
     later = [r for r in requests if r.id >= 3]
