@@ -111,6 +111,11 @@ def labelled(line: str) -> bool:
     return label is not None and bool(line[label.end() :].strip(" `*"))
 
 
+def takes_lines(text: str) -> bool:
+    """Whether one action is spread over several lines: a tool call in tags, or arguments on a line of their own."""
+    return "<function=" in text or "<invoke " in text or _INPUT.search(text) is not None
+
+
 def _plain(text: str) -> str:
     """Signs and marks of prose made plain: curly quotes, escaped underscores, tags and boxes around an answer."""
     text = text.translate(_SIGNS).replace("\\_", "_")

@@ -31,7 +31,7 @@ def parts(action: str) -> tuple[str, list[Any], dict[str, Any]]:
 def _named(action: str, name: str, arguments: str, **around: Any) -> str:
     """A JSON object with the action's name and arguments under the given keys; a menu entry has none."""
     what, args, kwargs = parts(action)
-    if what == action:
+    if what == action or (args and kwargs):
         return json.dumps({**around, name: action})
     return json.dumps({**around, name: what, arguments: kwargs if kwargs and not args else args or {}})
 

@@ -10,7 +10,7 @@ from typing import Any
 from agentspec.actions import canonical, parse_action
 from agentspec.llm.base import Message
 from agentspec.prompting import with_request
-from agentspec.reading import labelled, read, visible
+from agentspec.reading import labelled, read, takes_lines, visible
 from agentspec.reasoning.search.meter import Meter
 from agentspec.types import Action, ActionSchema, LLMCall
 
@@ -55,6 +55,9 @@ def read_steps(text: str, schema: ActionSchema, *, imagined: bool) -> list[str]:
     Lines with an `Action:` label count alone where there are any. An answer that is no list of lines may still be one
     action (JSON, a label and its call on the next line).
     """
+    whole = read_step(text, schema, imagined=imagined)
+    if whole is not None and takes_lines(text):
+        return [whole[0]]
     found: dict[Hashable, str] = {}
     lines = visible(text)[0].splitlines()
     for line in [line for line in lines if labelled(line)] or lines:
@@ -62,8 +65,7 @@ def read_steps(text: str, schema: ActionSchema, *, imagined: bool) -> list[str]:
         step = read_step(bare, schema, imagined=imagined) if bare.strip("` \t") else None
         if step is not None:
             found.setdefault(step[1], step[0])
-    whole = None if found else read_step(text, schema, imagined=imagined)
-    return [whole[0]] if whole is not None else list(found.values())
+    return list(found.values()) or ([whole[0]] if whole is not None else [])
 
 
 async def sample_steps(
