@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    "agentspec/DeliveryBenchDiscrete-v0": "agentspec.envs.deliverybench.discrete:make",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
+
+STEP_LIMITS = {"agentspec/DeliveryBench-v0": 5000, "agentspec/DeliveryBenchDiscrete-v0": 5000}
+"""Environment id -> steps after which every episode is cut."""
 
 _PUBLIC = {
     "ContractError": "agentspec.envs.contract",
@@ -27,7 +31,15 @@ _PUBLIC = {
     "make_env": "agentspec.envs.making",
 }
 
-__all__ = ["ENTRY_POINTS", "ContractError", "check_environment", "environment_id", "make_env", "register_all"]
+__all__ = [
+    "ENTRY_POINTS",
+    "STEP_LIMITS",
+    "ContractError",
+    "check_environment",
+    "environment_id",
+    "make_env",
+    "register_all",
+]
 
 
 def register_all() -> None:
@@ -35,7 +47,8 @@ def register_all() -> None:
     for name, entry_point in ENTRY_POINTS.items():
         if name not in gymnasium.registry:
             # The passive checker would validate every observation of every step; the test suite checks them instead.
-            gymnasium.register(id=name, entry_point=entry_point, disable_env_checker=True)
+            limit = STEP_LIMITS.get(name)
+            gymnasium.register(name, entry_point, max_episode_steps=limit, disable_env_checker=True)
 
 
 def __getattr__(name: str) -> Any:

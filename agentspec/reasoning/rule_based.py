@@ -27,9 +27,7 @@ def decision(text: str, input: AgentInput, rationale: str) -> Decision:
 
 
 def _player(task: Task, role: str, rng: random.Random, parameters: Mapping[str, Any]) -> Player:
-    from agentspec.episode import environment_id
-
-    return player(environment_id(task.env), role, task.options, rng, **parameters)
+    return player(task.env, role, task.options, rng, **parameters)
 
 
 class RuleBased(Stateless):
