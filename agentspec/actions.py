@@ -21,8 +21,8 @@ __all__ = ["MAX_LENGTH", "canonical", "parse_action", "same_action", "suggest"]
 def parse_action(text: str, schema: ActionSchema) -> Action | ActionError:
     """The action that `text` means; never raises.
 
-    With `schema.choices` one of the choices is the action of that text; anything else is still tried as a call. Argument
-    *values* are the environment's to judge; here only the form is: a known name and literal arguments.
+    With `schema.choices` one of the choices is the action of that text; anything else is still tried as a call.
+    Argument *values* are the environment's to judge; here only the form is: a known name and literal arguments.
     """
     return read(text, schema).action
 
@@ -52,8 +52,9 @@ def canonical(action: Action, schema: ActionSchema) -> Hashable:
 
 def same_action(one: Action | ActionError, other: Action | ActionError, schema: ActionSchema) -> bool:
     """Whether both are actions and do the same."""
-    both = isinstance(one, Action) and isinstance(other, Action)
-    return both and canonical(one, schema) == canonical(other, schema)
+    if not isinstance(one, Action) or not isinstance(other, Action):
+        return False
+    return canonical(one, schema) == canonical(other, schema)
 
 
 def _value(value: Any, parameter: Parameter) -> Any:

@@ -1,8 +1,8 @@
 """The language of actions: one call with literal arguments, `MOVE(12.5m, -3m, pace="accel")`.
 
 `scan_call` finds where a call ends, `parse_call` reads it, `render_call` writes one. Names are matched without case,
-through the schema's aliases, and whatever joins their words (`view orders`, `view-orders`). Numbers followed by a unit of
-the schema are multiplied by its factor. Arguments are read by Python's own expression parser restricted to literals;
+through the schema's aliases, and whatever joins their words (`view orders`, `view-orders`). Numbers followed by a unit
+of the schema are multiplied by its factor. Arguments are read by Python's own expression parser restricted to literals;
 nothing is ever evaluated. What chat models get wrong about literals is understood: words without quotes, `name: value`,
 `true` and `null`.
 """

@@ -10,9 +10,9 @@ The order of a prompt is fixed, and each thing stands in it once:
 What is too long is cut where nothing is lost that is acted on or judged: recalled items by priority, answers of others
 before their last line (`quote`), observations between actions that all stay (`course`).
 
-An answer is read by the one tolerant reader (`agentspec.reading`). One that holds no action is asked for again, with what
-was wrong with it, at most `max_retries` times; every such call is metered, counts in the call profile, and is credited
-like the one that succeeds.
+An answer is read by the one tolerant reader (`agentspec.reading`). One that holds no action is asked for again, with
+what was wrong with it, at most `max_retries` times; every such call is metered, counts in the call profile, and is
+credited like the one that succeeds.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def with_request(messages: Sequence[Message], request: str) -> tuple[Message, ..
 def sampled(call: LLMCall, completion: int = 0) -> Sampled:
     """The sampled turn of a call, token by token.
 
-    Where a backend reports no token ids, nothing is lost by leaving reasoning out of later prompts, as chat models expect.
+    Where a backend reports no token ids, nothing is lost by leaving reasoning out of later prompts, as chat models
+    expect.
     """
     found = call.completions[completion]
     return Sampled.of(found) if found.token_ids else Sampled(visible(found.text)[0])
@@ -242,7 +243,7 @@ def require_variety(method: str, services: Services, temperature: float | None =
     rejected = getattr(services.llm.recorder.llm, "rejected", {})
     if "temperature" in rejected:
         raise SpecError(
-            f"{method} votes among samples drawn at temperature {temperature}, but {services.llm.recorder.llm.name} does "
-            f"not take one ({rejected['temperature']}); choose a method of one answer (react, cot, direct), or a model "
-            "whose temperature can be set"
+            f"{method} votes among samples drawn at temperature {temperature}, but {services.llm.recorder.llm.name} "
+            f"does not take one ({rejected['temperature']}); choose a method of one answer (react, cot, direct), or a "
+            "model whose temperature can be set"
         )

@@ -2,16 +2,18 @@
 
 In this order:
 
-1. Reasoning blocks (`<think>`, `[THINK]`, harmony channels, ...), closed or cut off, are removed; nothing in them counts.
+1. Reasoning blocks (`<think>`, `[THINK]`, harmony channels, ...), closed or cut off, are removed; nothing in them
+counts.
 2. An action given as data (JSON, a tool call) counts where it comes before any `Action:` line.
-3. The *first* `Action:` line counts, in any case and dress, its call on the same or a later line. Whatever follows it, an
+3. The *first* `Action:` line counts, in any case and dress, its call on the same or a later line. Whatever follows it,
+an
    invented observation or a second turn, is dropped.
 4. Without a label: a line that is a call (or a menu entry), numbered, quoted or with a remark after it.
 5. A single call in a sentence, where it is marked as code or closes the answer, and is not negated.
 
 Everything else is an `ActionError` whose message tells the model what to write; an answer that was cut off before its
-action is told apart (`TRUNCATED`). The text of an error never reads as an action itself, so that whoever passes it on to
-an environment executes nothing.
+action is told apart (`TRUNCATED`). The text of an error never reads as an action itself, so that whoever passes it on
+to an environment executes nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ _SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]*\(")
 _SQUARE = re.compile(r"([A-Za-z_][\w.\-]*)[ \t]*\[")
 _WORD = re.compile(r"[A-Za-z_][\w\-]*")
 _REMARK = re.compile(
-    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|because\b|since\b|as\b|to\b|so\b|in order\b|and\b|then\b|or\b|if\b|for\b)",
+    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|"
+    r"(?:because|since|as|to|so|in order|and|then|or|if|for)\b)",
     re.IGNORECASE,
 )
 _NEGATED = re.compile(
@@ -188,8 +191,9 @@ class _Reader:
         found = self._line()
         if found is None:
             inline = _MID_LABEL.search(self.text)
-            found = (self._value(self.text[inline.end() :]), inline.start()) if inline else None
-        action, at = found if found and found[0] else (self._mention(), len(self.text))
+            value = self._value(self.text[inline.end() :]) if inline else None
+            found = (value, inline.start()) if inline and value else None
+        action, at = found or (self._mention(), len(self.text))
         if action is None:
             return Reading(self._nothing(self.text), _thought(self.text))
         return Reading(action, _thought(self.text[:at]))
@@ -250,7 +254,7 @@ class _Reader:
                 if text[given.end() :][:1] not in "{["
                 else text[given.end() :]
             )
-            data = shapes.find_shape('{"action": "%s", "args": ' % name + value.rstrip("`\n ") + "}", self.schema)
+            data = shapes.find_shape(f'{{"action": "{name}", "args": ' + value.rstrip("`\n ") + "}", self.schema)
             line = _first_line(value).strip("`\"'* ")
             inner = data.text if data is not None else f"{name}({line})"
             return self._value(inner)

@@ -101,7 +101,7 @@ def _decode(text: str, at: int) -> Any:
         return None
 
 
-def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:
+def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  # noqa: PLR0911  # one line per shape
     """The text of the action that `data` stands for, or `None`."""
     if depth > 4 or not data:
         return None

@@ -1,8 +1,8 @@
 """The forms in which chat models write an action: what a reader of answers must understand.
 
 Every entry of `FORMATS` takes an action (a call, or a menu entry) and dresses it as some family of models does: labels,
-Markdown, remarks, JSON, tool calls, reasoning blocks, invented later turns. `DECOY` stands where an action must *not* be
-read: in reasoning, and in what is made up after the answer.
+Markdown, remarks, JSON, tool calls, reasoning blocks, invented later turns. `DECOY` stands where an action must *not*
+be read: in reasoning, and in what is made up after the answer.
 """
 
 from __future__ import annotations
@@ -135,7 +135,8 @@ FORMATS: dict[str, Format] = {
     "reasoning block": lambda a, d: f"<reasoning>\nAction: {d}\n</reasoning>\nAction: {a}",
     "bracketed think block": lambda a, d: f"[THINK]{d}[/THINK]{a}",
     "harmony channels": lambda a, d: (
-        f"<|channel|>analysis<|message|>Action: {d}<|end|><|start|>assistant<|channel|>final<|message|>Action: {a}<|return|>"
+        f"<|channel|>analysis<|message|>Action: {d}<|end|><|start|>assistant<|channel|>"
+        f"final<|message|>Action: {a}<|return|>"
     ),
     "special token": lambda a, d: f"{a}<|im_end|>",
     "invented observation": lambda a, d: (

@@ -1,10 +1,10 @@
 """Can a strong model play through every method? `python -m benchmarks.play --json`.
 
 In the model's seat sits one that plays well (it knows what the scripted courier would do) and writes like a chat model:
-every answer in another of the forms of `benchmarks.formats`, reasoning blocks, JSON, tool calls and invented later turns
-among them. It is asked through the free protocol of an endpoint, so menus do not constrain it either. What is lost on the
-way from such an answer to the environment is the method's or the reader's fault: every method must complete deliveries,
-with `invalid_share` 0, at the number of calls it declares.
+every answer in another of the forms of `benchmarks.formats`, reasoning blocks, JSON, tool calls and invented later
+turns among them. It is asked through the free protocol of an endpoint, so menus do not constrain it either. What is
+lost on the way from such an answer to the environment is the method's or the reader's fault: every method must complete
+deliveries, with `invalid_share` 0, at the number of calls it declares.
 
 The table: `{"method": {"deliveries", "invalid_share", "calls_per_step"}}`, methods in native and in menu mode.
 """

@@ -214,3 +214,21 @@ def test_errors_never_read_as_actions(text: str) -> None:
 def test_the_reader_is_quick_on_hostile_answers() -> None:
     for text in ("MOVE(" * 20_000, "{" * 50_000, "Action: " * 10_000, "<think>" * 10_000, "`WAIT(" + "[" * 90_000):
         assert isinstance(parse_action(text, FIELD), ActionError)
+
+
+def test_the_couriers_actions_know_what_is_left_out_and_what_matters() -> None:
+    from agentspec.envs.deliverybench.world.grammar import schema_for
+    from agentspec.envs.deliverybench.world.rules import rules_named
+
+    for rules in ("fair", "original"):
+        schema = schema_for(rules_named(rules))
+        for one, other in [
+            ("MOVE(139.6m, 24m)", 'MOVE(139.8m, 24.1m, pace="normal")'),
+            ("ACCEPT_ORDER(0)", "ACCEPT_ORDER([0])"),
+            ("WAIT(60)", "WAIT(60.0)"),
+            ('BUY("ice_pack")', 'BUY(item_id="ice_pack", qty=1)'),
+            ("PICKUP(3)", "PICKUP(orders=[3])"),
+        ]:
+            assert same_action(parse_action(one, schema), parse_action(other, schema), schema), (one, other)
+        far = parse_action("MOVE(141m, 24m)", schema)
+        assert not same_action(far, parse_action("MOVE(139.6m, 24m)", schema), schema)

@@ -208,7 +208,13 @@ class OpenAILLM:
             if name in body and re.search(rf"\b{name}\b", problem):
                 self.rejected.setdefault(name, problem)
                 del body[name]
-                _LOG.warning("%s at %s does not take `%s` (%s); it is left out from now on", self.name, self.base_url, name, problem)
+                _LOG.warning(
+                    "%s at %s does not take `%s` (%s); it is left out from now on",
+                    self.name,
+                    self.base_url,
+                    name,
+                    problem,
+                )
                 return True
         return False
 

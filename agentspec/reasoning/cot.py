@@ -1,13 +1,14 @@
 """Chain of thought (Wei et al., 2022): think step by step, then act. The chain is not carried to the next step.
 
 The paper writes chain and answer in one completion, and so does this: free-text actions cost one call per step. In menu
-mode the chain is one call and the action a second one, decoded under the menu's constraint with the chain in its prompt.
-With `enable_history` the chains do stay in the conversation, as sampled.
+mode the chain is one call and the action a second one, decoded under the menu's constraint with the chain in its
+prompt. With `enable_history` the chains do stay in the conversation, as sampled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
@@ -58,7 +59,7 @@ class ChainOfThought(Stateless):
         at_least("cot", 0, max_retries=max_retries)
         self.services = services
         self.history = enable_history
-        self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
+        self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self.max_retries = max_retries
         self.follow_up = in_context(services) if enable_history else in_private
 

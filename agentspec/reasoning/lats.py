@@ -1,19 +1,19 @@
 """LATS, language agent tree search (Zhou et al., 2024): Monte-Carlo tree search in the environment itself.
 
-A node is a thought, an action and what the *real* environment answered to it: steps are tried, the environment is put back by a
-snapshot, and after the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with samples
-of the policy, lets a judge value the new states, goes on from the best one (to the end, or not at all with
-``rollout="value"``), and back-propagates the rewards on the way plus the last state's value. A path that ends without
+A node is a thought, an action and what the *real* environment answered to it: steps are tried, the environment is put
+back by a snapshot, and after the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with
+samples of the policy, lets a judge value the new states, goes on from the best one (to the end, or not at all with
+`rollout="value"`), and back-propagates the rewards on the way plus the last state's value. A path that ends without
 success is reflected on in words, and later proposals and judgements are shown these lessons. A success ends the search.
 
-Rewards are brought to the unit interval of the judge's values by the environment's declared `typical_return` (and cut off
-at -1 and 1 per step), and a path counts as a success where the environment says so or its return reaches that scale: one
-dollar is neither worth ten good judgements nor the end of the search.
+Rewards are brought to the unit interval of the judge's values by the environment's declared `typical_return` (and cut
+off at -1 and 1 per step), and a path counts as a success where the environment says so or its return reaches that
+scale: one dollar is neither worth ten good judgements nor the end of the search.
 
 Cost per step at the paper's size: up to a thousand calls; preset `rl`: at most 22.
 
-Without snapshots the method is not LATS: it is refused, or, with ``world="model"``, the model predicts what would be
-observed, as in RAP, and the trace says ``world: model``.
+Without snapshots the method is not LATS: it is refused, or, with `world="model"`, the model predicts what would be
+observed, as in RAP, and the trace says `world: model`.
 """
 
 from __future__ import annotations
@@ -88,25 +88,25 @@ class LanguageAgentTreeSearch:
     """Monte-Carlo tree search in the real environment.
 
     Args:
-        preset: ``paper`` (30 iterations, depth 7, 5 samples and 10 at the root, simulation to the end; for evaluation:
-            up to 10**3 calls per decision) or ``rl`` (4 iterations, depth 3, 3 samples, value instead of simulation).
+        preset: `paper` (30 iterations, depth 7, 5 samples and 10 at the root, simulation to the end; for evaluation:
+            up to 10**3 calls per decision) or `rl` (4 iterations, depth 3, 3 samples, value instead of simulation).
         num_iterations, max_depth: size of the search.
         n_generate_sample, root_samples: samples per expansion, and of the root.
-        rollout: ``simulate`` (follow the best value to an end or the depth limit) or ``value`` (trust the judge).
+        rollout: `simulate` (follow the best value to an end or the depth limit) or `value` (trust the judge).
         exploration: weight w of UCT.
         mix: share of the judge's rating in a state's value (the paper's lambda); the rest is the share of samples.
         evaluations: ratings per state, averaged.
-        success_return: an ended path is a success from this return on, where the environment reports no ``success``
-            (``None``: its ``typical_return``).
-        reward_scale: factor on rewards, to bring them to the scale of values (``None``: 1 / ``typical_return``).
+        success_return: an ended path is a success from this return on, where the environment reports no `success`
+            (`None`: its `typical_return`).
+        reward_scale: factor on rewards, to bring them to the scale of values (`None`: 1 / `typical_return`).
         max_reflections: lessons kept in an episode (0: none are made).
-        world: ``environment`` or ``model``, see the module's docstring.
+        world: `environment` or `model`, see the module's docstring.
         temperature: of proposals.
-        max_calls: most requests per decision (``None``: no limit).
-        max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
+        max_calls: most requests per decision (`None`: no limit).
+        max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
         path_tokens, lesson_tokens: budgets of prompt sections; of a path only observations are clipped.
         prediction_tokens: most tokens of a predicted observation, of a rating in words, and of a reflection.
-        thought_tokens: most tokens of a proposal (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a proposal (`None`: the spec's `max_tokens`).
         max_retries: further calls if nothing that was proposed is an action.
     """
 
@@ -181,7 +181,7 @@ class LanguageAgentTreeSearch:
         """Forget the lessons of the last episode.
 
         Raises:
-            SpecError: the environment cannot be put back and ``world`` is not ``model``.
+            SpecError: the environment cannot be put back and `world` is not `model`.
         """
         if self.world == "environment" and self.services.simulator is None:
             raise SpecError(
@@ -252,7 +252,7 @@ class LanguageAgentTreeSearch:
         return node.terminal or node.depth >= self.depth
 
     async def _descend(self, search: Search, path: list[Node]) -> bool:
-        """Expand the last node of ``path`` and go on to its best child; ``False`` if there is none."""
+        """Expand the last node of `path` and go on to its best child; `False` if there is none."""
         node = path[-1]
         if self._over(node):
             return False
@@ -271,7 +271,7 @@ class LanguageAgentTreeSearch:
         return self._return(node) >= self.success_return
 
     def _return(self, node: Node) -> float:
-        """Rewards from the root to ``node``, in the environment's own scale."""
+        """Rewards from the root to `node`, in the environment's own scale."""
         return sum(n.state.reward for n in node.path[1:])
 
     async def _expand(self, search: Search, node: Node) -> None:
@@ -305,7 +305,7 @@ class LanguageAgentTreeSearch:
                 close(child)
 
     async def _judge(self, search: Search, children: Sequence[Node], wanted: int) -> None:
-        """Value of each state that is no end: ``mix`` of the judge's rating (0 to 1) and the share of samples."""
+        """Value of each state that is no end: `mix` of the judge's rating (0 to 1) and the share of samples."""
         alive = [child for child in children if not child.terminal]
         for child in children:
             child.prior = child.reward
@@ -320,7 +320,7 @@ class LanguageAgentTreeSearch:
         search.meter.stop()
 
     def _request(self, node: Node, form: str) -> str:
-        """Lessons, the steps up to ``node`` with what came of them, and what is asked."""
+        """Lessons, the steps up to `node` with what came of them, and what is asked."""
         parts = []
         if self._lessons:
             lessons = "\n".join(f"- {lesson}" for lesson in self._lessons)

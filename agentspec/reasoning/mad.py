@@ -2,9 +2,9 @@
 
 Every agent has a dialogue of its own. Round 0 is independent. In each later round an agent is shown what the *others*
 answered in the round before, all at once, checks it and its own, and gives an updated answer; nobody sees an answer of
-the running round. The action is the majority of the last round over what actions do, the first one on a tie. A lone agent
-is asked to check its own answer. As in the paper the agents are one model sampled at a temperature: greedy agents would be
-copies of each other, and are refused.
+the running round. The action is the majority of the last round over what actions do, the first one on a tie. A lone
+agent is asked to check its own answer. As in the paper the agents are one model sampled at a temperature: greedy agents
+would be copies of each other, and are refused.
 
 An answer is quoted within `quote_tokens`: reasons are clipped, the proposed action never is.
 
@@ -62,7 +62,7 @@ END_WITH_ACTION = "End with one line of the form Action: NAME(arguments)."
 
 @dataclass
 class Adviser:
-    """One agent: its private dialogue and its answers, newest last (``None``: no legal action in that round)."""
+    """One agent: its private dialogue and its answers, newest last (`None`: no legal action in that round)."""
 
     messages: tuple[Message, ...]
     texts: list[str] = field(default_factory=list)
@@ -73,14 +73,14 @@ class MultiAgentDebate(Stateless):
     """A debate per decision.
 
     Args:
-        preset: ``paper`` (3 agents, 2 rounds after the first, as AgentSpec) or ``rl`` (2 agents, 1 round, no
+        preset: `paper` (3 agents, 2 rounds after the first, as AgentSpec) or `rl` (2 agents, 1 round, no
             arguments in menu mode).
         num_agents: agents.
         num_rounds: rounds of debate after the independent one.
         argue: menu mode: argue in words before every choice.
         sampling_temperature: temperature of the answers; above 0, or the advisers would be one.
         quote_tokens: most tokens quoted of one other answer; its action is always among them.
-        thought_tokens: most tokens of an answer in words (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of an answer in words (`None`: the spec's `max_tokens`).
         max_retries: further calls if no adviser names an action.
     """
 

@@ -1,14 +1,14 @@
 """Plan-and-Solve (Wang et al., 2023): understand the task and devise a plan, then carry it out.
 
 The paper asks for both in one completion, anew for every question, and that is the default here: each step plans from
-where things stand and ends with the plan's first action. One call per step and some 1.6 times the output of a bare chain;
-in menu mode one call for plan and reasoning and one constrained choice.
+where things stand and ends with the plan's first action. One call per step and some 1.6 times the output of a bare
+chain; in menu mode one call for plan and reasoning and one constrained choice.
 
-`persistent` is the form for agents whose plans shall outlive a step: a numbered list of sub-goals is made once, and every
-step works on the current one. A step that reports its sub-goal as done moves on to the next. A new plan is made when the
-plan is carried out, after `replan_failures` failed actions in a row (the planner is shown them), on news (the environment
-reports one of `replan_on` among its `events`, or what there is to do has changed), or every `replan_every` steps; and no
-plan is made before there is anything to see. One call per step, and one per plan.
+`persistent` is the form for agents whose plans shall outlive a step: a numbered list of sub-goals is made once, and
+every step works on the current one. A step that reports its sub-goal as done moves on to the next. A new plan is made
+when the plan is carried out, after `replan_failures` failed actions in a row (the planner is shown them), on news (the
+environment reports one of `replan_on` among its `events`, or what there is to do has changed), or every `replan_every`
+steps; and no plan is made before there is anything to see. One call per step, and one per plan.
 
 In the `conversation` layout a persistent plan and the planner's request are turns of the conversation, exactly as
 sampled, so an episode stays one token sequence; the plan is shown again when the conversation no longer holds it.
@@ -78,14 +78,14 @@ class PlanAndSolve:
     """Planning before acting.
 
     Args:
-        preset: `paper` (plan and solution together, every step) or `rl` (a persistent short plan, and steps that in menu
-            mode act without further words).
+        preset: `paper` (plan and solution together, every step) or `rl` (a persistent short plan, and steps that in
+            menu mode act without further words).
         persistent: make a plan once and keep it.
         plus: PS+: also ask for quantities and intermediate results.
         max_retries: further calls for an answer that holds no action.
         thought_tokens: most tokens of a step's words (`None`: the spec's `max_tokens`).
-        think: persistent, menu mode: work the step out in words before the constrained choice. Without it nobody reports
-            a sub-goal as done, so plans end by failures, news or `replan_every`.
+        think: persistent, menu mode: work the step out in words before the constrained choice. Without it nobody
+            reports a sub-goal as done, so plans end by failures, news or `replan_every`.
         replan_every: steps after which a new plan is made (0: never for this reason).
         replan_failures: failed actions in a row after which a new plan is made (0: never for this reason).
         replan_on: names of events of the environment after which a new plan is made.

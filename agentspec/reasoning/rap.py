@@ -8,14 +8,14 @@ returns, lazy states, simulation by fast reward, back-propagation; the answer is
 
 The paper's problems are puzzles whose paths are equally long and pay only at the goal. For agents three things differ.
 Ending earns nothing by itself: a sum of negative log-probabilities would reward the path that dies first, so an end
-without the goal is charged, at its own rate, for the steps that were left and one more. What the world model says a step earns
-(in the environment's unit, divided by the environment's `typical_return`) enters as a share of the goal's reward. And with
-`reward="normalised"` (preset `rl`) log p(action) is taken per token, so that long calls are not the worse ones for their
-length. With `reward="paper"` and a model that predicts no earnings the numbers are the paper's.
+without the goal is charged, at its own rate, for the steps that were left and one more. What the world model says a
+step earns (in the environment's unit, divided by the environment's `typical_return`) enters as a share of the goal's
+reward. And with `reward="normalised"` (preset `rl`) log p(action) is taken per token, so that long calls are not the
+worse ones for their length. With `reward="paper"` and a model that predicts no earnings the numbers are the paper's.
 
-The first action of the best path is executed. Log-probabilities need a backend that scores; `evaluation="samples"` counts
-samples instead. Nothing is executed while it searches: all states but the root's are imagined. Cost per step: at most one
-proposal and one prediction per new node, and a scoring per proposed action.
+The first action of the best path is executed. Log-probabilities need a backend that scores; `evaluation="samples"`
+counts samples instead. Nothing is executed while it searches: all states but the root's are imagined. Cost per step: at
+most one proposal and one prediction per new node, and a scoring per proposed action.
 """
 
 from __future__ import annotations
@@ -135,24 +135,24 @@ class ReasoningViaPlanning(Stateless):
     """Monte-Carlo tree search in the model's imagination.
 
     Args:
-        preset: ``paper`` (10 iterations, depth 5, 4 actions) or ``rl`` (3, 3, 3, short predictions).
+        preset: `paper` (10 iterations, depth 5, 4 actions) or `rl` (3, 3, 3, short predictions).
         num_iterations: paths sampled per decision.
         depth: most steps of a path.
         num_actions: actions sampled per state.
         exploration: weight w of UCT.
         alpha: share of the model's own judgement in the reward; the rest is the goal's.
         goal_reward: what reaching the goal counts, on the scale of log-probabilities.
-        reward: ``paper`` (log p of the whole action) or ``normalised`` (per token).
-        evaluation: ``score`` (log-probabilities) or ``samples`` (Monte-Carlo, for backends that cannot score).
-        eval_samples: samples of a judgement under ``samples``.
-        output: the path that decides: ``max_reward`` (greatest sum), ``max_visits`` (most visited child at each level)
-            or ``max_iter`` (the best single iteration).
+        reward: `paper` (log p of the whole action) or `normalised` (per token).
+        evaluation: `score` (log-probabilities) or `samples` (Monte-Carlo, for backends that cannot score).
+        eval_samples: samples of a judgement under `samples`.
+        output: the path that decides: `max_reward` (greatest sum), `max_visits` (most visited child at each level)
+            or `max_iter` (the best single iteration).
         temperature: of proposals and predictions.
-        max_calls: most requests and scorings per decision (``None``: no limit).
-        max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
+        max_calls: most requests and scorings per decision (`None`: no limit).
+        max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
         path_tokens: budgets of prompt sections.
         prediction_tokens: most tokens of a predicted observation.
-        thought_tokens: most tokens of a proposed action (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a proposed action (`None`: the spec's `max_tokens`).
         max_retries: further calls if nothing that was proposed is an action.
     """
 

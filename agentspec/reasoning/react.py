@@ -2,10 +2,10 @@
 
 In the paper a thought is an action of its own that the environment answers with nothing. Here a thought is a turn that
 the scaffold acknowledges; it uses a step of the loop and none of the environment. With free-text actions one completion
-usually holds thought and action, one call per step: any answer that reads as an action is one, however it is dressed. An
-answer without one is a thought, and after `max_iterations` of those the action is asked for alone. An action that cannot
-be read is asked for again (`max_retries`). In menu mode a thought is followed by the action, decoded under the menu's
-constraint: two calls per step. A completion never writes observations: it is stopped where it begins one.
+usually holds thought and action, one call per step: any answer that reads as an action is one, however it is dressed.
+An answer without one is a thought, and after `max_iterations` of those the action is asked for alone. An action that
+cannot be read is asked for again (`max_retries`). In menu mode a thought is followed by the action, decoded under the
+menu's constraint: two calls per step. A completion never writes observations: it is stopped where it begins one.
 
 In the `conversation` layout the transcript is the context itself; in `snapshot` it is rendered into the user turn.
 """
@@ -107,7 +107,7 @@ class ReAct:
                 return self._decision(Acted(reading, call, tuple(calls)), words)
             reply = ACKNOWLEDGED
             meant = isinstance(reading.action, ActionError) and (
-                reading.explicit or reading.action.code == "TRUNCATED" or reading.action.code == "PARSE_AMBIGUOUS"
+                reading.explicit or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
             )
             if meant and retries and not schema.choices:
                 assert isinstance(reading.action, ActionError)

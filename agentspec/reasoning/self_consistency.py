@@ -37,7 +37,7 @@ class Vote:
 
 
 def vote(text: str, rationale: str, schema: ActionSchema, calls: tuple[tuple[int, int], ...]) -> Vote | None:
-    """The vote of an answer; ``None`` if it holds no legal action."""
+    """The vote of an answer; `None` if it holds no legal action."""
     action = read(text, schema).action
     return Vote(action, rationale, calls) if isinstance(action, Action) else None
 
@@ -50,7 +50,7 @@ class Tally:
 
     @classmethod
     def of(cls, votes: Sequence[Vote], schema: ActionSchema) -> Tally:
-        """Count ``votes`` over canonical actions."""
+        """Count `votes` over canonical actions."""
         groups: dict[Hashable, list[Vote]] = {}
         for vote in votes:
             groups.setdefault(canonical(vote.action, schema), []).append(vote)
@@ -72,13 +72,13 @@ class SelfConsistency(Stateless):
     """A vote over independent chains.
 
     Args:
-        preset: ``paper`` (5 samples, as AgentSpec) or ``rl`` (3).
+        preset: `paper` (5 samples, as AgentSpec) or `rl` (3).
         samples: chains per decision.
         sampling_temperature: temperature of the chains; above 0, or they would not be independent.
-        credit: which completions are credited as executed: those of the answer ``returned``, or of the whole
-            ``majority``; the others are credited as explored.
+        credit: which completions are credited as executed: those of the answer `returned`, or of the whole
+            `majority`; the others are credited as explored.
         max_retries: further calls if no chain holds an action.
-        thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a chain (`None`: the spec's `max_tokens`).
     """
 
     declaration = Declaration(
@@ -142,7 +142,7 @@ class SelfConsistency(Stateless):
         )
 
     async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
-        """Chain and action in one completion; ``None`` for an answer without a legal action."""
+        """Chain and action in one completion; `None` for an answer without a legal action."""
         asked = await meter.ask_all(
             [Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
         )

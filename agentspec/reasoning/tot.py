@@ -1,10 +1,10 @@
 """Tree of Thoughts (Yao et al., 2023): grow, judge and prune a tree of partial solutions before acting.
 
 A thought is one more step of a short course of action. From each kept partial course the policy generates
-``num_thoughts`` continuations (``propose``: one answer lists them; ``sample``: independent samples); a separate call
-judges every candidate (``value``: sure, likely or impossible, several times; ``estimate``: also how much would come of
-it, in the environment's unit; ``vote``: which of them is best); breadth-
-first search keeps the ``breadth`` best of a layer, depth-first search follows the best child first, prunes what is
+`num_thoughts` continuations (`propose`: one answer lists them; `sample`: independent samples); a separate call
+judges every candidate (`value`: sure, likely or impossible, several times; `estimate`: also how much would come of
+it, in the environment's unit; `vote`: which of them is best); breadth-
+first search keeps the `breadth` best of a layer, depth-first search follows the best child first, prunes what is
 judged too low, and backtracks. The first action of the best course is executed; the next step searches anew.
 
 In menu mode the first step is decoded under the menu's constraint (always as samples); later steps are imagined, their
@@ -56,8 +56,8 @@ VALUE = (
 VALUE_WORD = "{course}Can this course of action lead to a good result of the task? Answer sure, likely or impossible."
 ESTIMATE = (
     "{course}What would come of this course of action in the end? Weigh it in a sentence or two. Then write a line "
-    "'Estimate: ' and how much it would bring, as a number in the task's own unit, and a last line with one word for how "
-    "certain that is: sure, likely or impossible."
+    "'Estimate: ' and how much it would bring, as a number in the task's own unit, and a last line with one word for "
+    "how certain that is: sure, likely or impossible."
 )
 VOTE = "These courses of action are under consideration:\n{listed}\n\nWhich one is best? {form}"
 VOTE_FREE = "Compare them briefly, then end with the number of the best one."
@@ -95,22 +95,22 @@ class TreeOfThoughts(Stateless):
     """A tree search over courses of action.
 
     Args:
-        preset: ``paper`` (3 thoughts, breadth 2, depth 3, 3 evaluations) or ``rl`` (breadth 1, depth 2, 1).
-        search_strategy: ``BFS`` or ``DFS``.
-        generation: ``propose`` or ``sample``.
-        evaluation_strategy: ``value``, ``estimate`` (for tasks that pay amounts: the estimate times 1, 0.5 or 0) or
-            ``vote``.
-        selection: BFS keeps the best (``greedy``) or draws in proportion to the judgements (``sample``).
+        preset: `paper` (3 thoughts, breadth 2, depth 3, 3 evaluations) or `rl` (breadth 1, depth 2, 1).
+        search_strategy: `BFS` or `DFS`.
+        generation: `propose` or `sample`.
+        evaluation_strategy: `value`, `estimate` (for tasks that pay amounts: the estimate times 1, 0.5 or 0) or
+            `vote`.
+        selection: BFS keeps the best (`greedy`) or draws in proportion to the judgements (`sample`).
         num_thoughts: continuations k per partial course.
         breadth: BFS: courses b kept per layer; DFS: complete courses after which it stops.
         depth: steps T of a course, at least 2 (one level would be best-of-n).
         evaluations: judgements per candidate, or votes.
         threshold: DFS: candidates whose mean judgement lies below are pruned.
         temperature: of all calls.
-        max_calls: most requests per decision (``None``: no limit).
-        max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
+        max_calls: most requests per decision (`None`: no limit).
+        max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
         course_tokens: budgets of prompt sections.
-        thought_tokens: most tokens of a proposal or a judgement (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a proposal or a judgement (`None`: the spec's `max_tokens`).
         max_retries: further calls if nothing that was proposed is an action.
     """
 
@@ -205,7 +205,7 @@ class TreeOfThoughts(Stateless):
             frontier = self._select(candidates)
 
     def _select(self, candidates: list[Node]) -> list[Node]:
-        """The nodes kept: the ``breadth`` best, or as many drawn in proportion to their values without repetition."""
+        """The nodes kept: the `breadth` best, or as many drawn in proportion to their values without repetition."""
         if self.greedy:
             return sorted(candidates, key=lambda n: -n.prior)[: self.breadth]
         left, kept = list(candidates), list[Node]()

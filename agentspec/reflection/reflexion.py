@@ -2,12 +2,12 @@
 
 At the end of a failed episode the model reads the trial, its return and the earlier lessons, and writes what to do
 differently; the last `max_reflections` lessons stand in every prompt of the next trials. There is no reflection after a
-success, and none within an episode. What counts as failure is said in `agentspec.reflection.trials.failed`: where a task
-is graded and not simply won or lost, a trial that does not beat the best one so far.
+success, and none within an episode. What counts as failure is said in `agentspec.reflection.trials.failed`: where a
+task is graded and not simply won or lost, a trial that does not beat the best one so far.
 
-Lessons outlive the episode, so the method needs `scope: run`; with `scope: episode` it would pay for lessons that nobody
-reads, and is refused. They belong to one task and seed; for streams of unseen tasks, `key="family"` shares them among all
-tasks of the same world and options. Cost: no call per step, one per failed episode.
+Lessons outlive the episode, so the method needs `scope: run`; with `scope: episode` it would pay for lessons that
+nobody reads, and is refused. They belong to one task and seed; for streams of unseen tasks, `key="family"` shares them
+among all tasks of the same world and options. Cost: no call per step, one per failed episode.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Reflexion:
 
     Args:
         max_reflections: lessons shown, the newest ones.
-        threshold: returns below are failures (``None``: returns below the best so far).
+        threshold: returns below are failures (`None`: returns below the best so far).
         max_repeats: the same unrewarded action this often in a row is a failure (0: not looked at).
-        key: ``task`` or ``family``.
+        key: `task` or `family`.
         reflection_tokens: most tokens of a lesson.
         trial_tokens: budget of the trial's steps in the reflector's prompt.
         control: a text that stands in for every lesson, and no model call: what a lesson must be better than.

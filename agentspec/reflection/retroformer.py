@@ -2,21 +2,22 @@
 
 It acts like Reflexion: a retrospective model reads a failed trial, its return and the earlier lessons, and writes a
 lesson that stands in the actor's prompts. What makes it Retroformer is the training: the actor is frozen, and a lesson
-is paid the change of return it brought, ``G(next trial) - G(this trial)``.
+is paid the change of return it brought, `G(next trial) - G(this trial)`.
 
 *As it comes the reflector is untrained*: it is the policy's own weights, and the module measures what training needs.
-The call that writes a lesson is tagged ``reflection.retroformer/reflect`` and credited as executed; its reward is known
-one trial later and is recorded in *that* trial's metrics (``reflection/reward`` and whose call it pays).
-:func:`reflection_samples` joins the two. Samples of one ``group`` reflect on the same failed trial and are each
+The call that writes a lesson is tagged `reflection.retroformer/reflect` and credited as executed; its reward is known
+one trial later and is recorded in *that* trial's metrics (`reflection/reward` and whose call it pays).
+`reflection_samples` joins the two. Samples of one `group` reflect on the same failed trial and are each
 followed by a trial of their own, so their rewards compare like with like.
 
-``when`` says in which of the two trials the lesson is written: at the ``end`` of the failed one, or at the ``start`` of
-the next. What the reflector reads is the same. With ``start`` a lesson and the trial that pays it are one episode, so
-that many lessons can be drawn from the memory that one failed trial left: :mod:`trainers.retroformer` trains on these.
+`when` says in which of the two trials the lesson is written: at the `end` of the failed one, or at the `start` of
+the next. What the reflector reads is the same. With `start` a lesson and the trial that pays it are one episode, so
+that many lessons can be drawn from the memory that one failed trial left: `trainers.retroformer` trains on these.
 
-The reflector reads the actions on offer, the fullest view of the trial (the pool of orders, say), and the thought behind
-each step. `control` puts a fixed text in the place of every lesson: a meaningless one is what a trained reflector is to be
-compared with, since any text in the prompt changes what an actor does. Cost: one call per failed episode.
+The reflector reads the actions on offer, the fullest view of the trial (the pool of orders, say), and the thought
+behind each step. `control` puts a fixed text in the place of every lesson: a meaningless one is what a trained
+reflector is to be compared with, since any text in the prompt changes what an actor does. Cost: one call per failed
+episode.
 """
 
 from __future__ import annotations
@@ -84,9 +85,9 @@ class Retroformer(Reflexion):
     Args:
         max_prompt_updates: lessons shown to the actor, the newest ones.
         threshold, max_repeats, key, reflection_tokens, trial_tokens, control: as in
-            :class:`~agentspec.reflection.reflexion.Reflexion`.
-        when: whether a lesson is written at the ``end`` of the failed trial or at the ``start`` of the next one.
-        temperature: sampling temperature of lessons (``None``: the agent's).
+            `agentspec.reflection.reflexion.Reflexion`.
+        when: whether a lesson is written at the `end` of the failed trial or at the `start` of the next one.
+        temperature: sampling temperature of lessons (`None`: the agent's).
     """
 
     declaration = Declaration(
@@ -169,7 +170,7 @@ class Retroformer(Reflexion):
         return call
 
     def metrics(self) -> dict[str, Any]:
-        """What the lesson of the trial before was worth (if there was one), and whether this trial's is ``due``."""
+        """What the lesson of the trial before was worth (if there was one), and whether this trial's is `due`."""
         return self._measured | ({"due": True} if self._key in self._due else {})
 
     def snapshot(self) -> bytes:

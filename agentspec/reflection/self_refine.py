@@ -1,15 +1,15 @@
 """Self-Refine (Madaan et al., 2023): feedback on an answer, another answer, and again, until the critic is content.
 
-One model plays two roles in separate calls. The critic sees what the actor saw (memory and the conversation included), the
-candidate action and its rationale, and says, before it is executed, what is wrong with it; the refiner answers anew. Both
-are shown the history of attempts and feedback; of a long one the oldest feedback is cut, never an attempt. It ends when the
-critic keeps the action, when a refinement changes nothing, or after `max_iterations`. The verdict is asked for first, so
-that it cannot be cut off; a critic who gives none has not asked for a change. A refinement that is no legal action is
-ignored: the action stands, and the history says so. An illegal first action is shown to the critic with its error, so the
-method repairs what a reasoner could not parse.
+One model plays two roles in separate calls. The critic sees what the actor saw (memory and the conversation included),
+the candidate action and its rationale, and says, before it is executed, what is wrong with it; the refiner answers
+anew. Both are shown the history of attempts and feedback; of a long one the oldest feedback is cut, never an attempt.
+It ends when the critic keeps the action, when a refinement changes nothing, or after `max_iterations`. The verdict is
+asked for first, so that it cannot be cut off; a critic who gives none has not asked for a change. A refinement that is
+no legal action is ignored: the action stands, and the history says so. An illegal first action is shown to the critic
+with its error, so the method repairs what a reasoner could not parse.
 
-When an action is replaced, its rationale is too; its calls are credited as explored and the refining call as executed; a
-plan that goes on to guide later steps keeps its credit. Cost per step: 1 call (kept at once) to 2 per iteration.
+When an action is replaced, its rationale is too; its calls are credited as explored and the refining call as executed;
+a plan that goes on to guide later steps keeps its credit. Cost per step: 1 call (kept at once) to 2 per iteration.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ REASONS = "Its reasons: {reasons}"
 FEEDBACK_ON = "Feedback on attempt {number}: {feedback}"
 ASK_FEEDBACK = (
     "The latest attempt has not been carried out yet. Judge it as a strict critic: is it possible now, does it serve "
-    "the task, is there something clearly better? Begin with a line 'Verdict: keep' if it should be carried out as it is, "
-    "otherwise 'Verdict: change'. Then name concrete changes in one to three sentences."
+    "the task, is there something clearly better? Begin with a line 'Verdict: keep' if it should be carried out as it "
+    "is, otherwise 'Verdict: change'. Then name concrete changes in one to three sentences."
 )
 ASK_REFINED = "Take all of the feedback into account and give a better attempt. {how}"
 
@@ -71,7 +71,7 @@ class SelfRefine:
     """Feedback and refinement of every decision.
 
     Args:
-        preset: ``paper`` (at most 3 iterations, as AgentSpec) or ``rl`` (1, short feedback).
+        preset: `paper` (at most 3 iterations, as AgentSpec) or `rl` (1, short feedback).
         max_iterations: most pairs of feedback and refinement.
         feedback_tokens: most tokens of a feedback.
         history_tokens: budget of attempts and feedback in a prompt; the oldest feedback goes first.

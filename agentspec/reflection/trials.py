@@ -1,7 +1,7 @@
 """Trials of a task: what counts as failure, which lessons belong to it, and how a trial reads.
 
-Shared by the methods that learn in words from one episode to the next. Lessons are kept per task (``key="task"``: the
-same world, options and seed, tried again) or per task family (``key="family"``: the same world and options, whatever
+Shared by the methods that learn in words from one episode to the next. Lessons are kept per task (`key="task"`: the
+same world, options and seed, tried again) or per task family (`key="family"`: the same world and options, whatever
 the seed), which is what a stream of unseen tasks needs.
 """
 
@@ -33,7 +33,7 @@ MAX_THOUGHT = 200
 
 
 def key_of(task: Task, by: str) -> str:
-    """The name under which lessons of ``task`` are kept."""
+    """The name under which lessons of `task` are kept."""
     if by == "task":
         return task.key
     text = json.dumps([task.env, task.options], sort_keys=True, default=str)
@@ -54,11 +54,11 @@ class TrialLog:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> TrialLog:
-        """Read :meth:`to_data`."""
+        """Read `to_data`."""
         return cls(data["trials"], data["best"], [(number, text) for number, text in data["lessons"]])
 
     def recall(self, last: int, source: str) -> Recall:
-        """The ``last`` lessons, in the order they were learnt; the newest matter most."""
+        """The `last` lessons, in the order they were learnt; the newest matter most."""
         shown = [(TRIAL.format(number=number, lesson=text), number) for number, text in self.lessons[-last:]]
         return Recall(tuple(RecallItem(text, kind="lesson", source=source, priority=n) for text, n in shown))
 
@@ -107,9 +107,9 @@ def trial_prompt(
 ) -> tuple[Message, ...]:
     """The trial as a reflector reads it.
 
-    The task and its actions; earlier lessons; how it began, and the fullest view of the trial (the board of offers, say)
-    in `view_tokens` each; its steps with the thought behind each and what came of it, the newest that fit into `budget`
-    tokens; its return; the request.
+    The task and its actions; earlier lessons; how it began, and the fullest view of the trial (the board of offers,
+    say) in `view_tokens` each; its steps with the thought behind each and what came of it, the newest that fit into
+    `budget` tokens; its return; the request.
     """
     first = trajectory.transitions[0].input
     count = services.llm.count_tokens

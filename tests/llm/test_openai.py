@@ -327,7 +327,11 @@ def test_max_tokens_takes_its_new_name_where_asked_for(server):
     server.script = [error(400, said), answer("a")]
     backend = llm(server)
     ask(backend, user("x"), max_tokens=7), ask(backend, user("x"), max_tokens=7)
-    assert [(b.get("max_tokens"), b.get("max_completion_tokens")) for b in server.bodies] == [(7, None), (None, 7), (None, 7)]
+    assert [(b.get("max_tokens"), b.get("max_completion_tokens")) for b in server.bodies] == [
+        (7, None),
+        (None, 7),
+        (None, 7),
+    ]
     assert not backend.rejected
 
 

@@ -1,4 +1,4 @@
-"""Every form in which a chat model writes an action, through every reasoner and reflector: read, executed, at no extra call."""
+"""Every form in which a chat model writes an action, through every reasoner and reflector: read, and executed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,14 @@ SMALL = {
     "self_consistency": {"name": "self_consistency", "samples": 2},
     "mad": {"name": "mad", "num_agents": 2, "num_rounds": 1},
     "tot, propose": {"name": "tot", "num_thoughts": 1, "breadth": 1, "depth": 2, "evaluations": 1},
-    "tot, sample": {"name": "tot", "generation": "sample", "num_thoughts": 1, "breadth": 1, "depth": 2, "evaluations": 1},
+    "tot, sample": {
+        "name": "tot",
+        "generation": "sample",
+        "num_thoughts": 1,
+        "breadth": 1,
+        "depth": 2,
+        "evaluations": 1,
+    },
     "rap": {"name": "rap", "num_iterations": 1, "depth": 1, "num_actions": 1},
     "lats": {"name": "lats", "preset": "rl", "num_iterations": 1, "n_generate_sample": 1, "root_samples": 1},
 }

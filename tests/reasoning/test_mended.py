@@ -1,4 +1,4 @@
-"""What the methods' papers do and an agent must not lose: votes over what actions do, whole actions under judgement, scales."""
+"""What the methods' papers do and an agent must not lose: votes, whole actions under judgement, scales."""
 
 from __future__ import annotations
 
@@ -43,7 +43,13 @@ def services() -> Services:
 
 
 def test_three_spellings_of_one_move_outvote_two_looks_at_the_board() -> None:
-    texts = ["VIEW_ORDERS()", "MOVE(120, -48)", "VIEW_ORDERS()", 'MOVE(x=120.2, y=-48, pace="normal")', "MOVE(120.0, -48.1)"]
+    texts = [
+        "VIEW_ORDERS()",
+        "MOVE(120, -48)",
+        "VIEW_ORDERS()",
+        'MOVE(x=120.2, y=-48, pace="normal")',
+        "MOVE(120.0, -48.1)",
+    ]
     votes = [vote(text, text, MOVES, ((i, 0),)) for i, text in enumerate(texts)]
     tally = Tally.of([v for v in votes if v], MOVES)
     assert tally.winner.action.name == "MOVE" and [len(g) for g in tally.groups] == [3, 2]
@@ -88,7 +94,7 @@ def test_votes_without_a_temperature_are_refused_with_the_reason(method: str) ->
     from agentspec.spec import AgentSpec
     from agentspec.types import Task
 
-    with pytest.raises(SpecError, match="Unsupported parameter.*choose a method of one answer"):
+    with pytest.raises(SpecError, match=r"Unsupported parameter.*choose a method of one answer"):
         Runner(AgentSpec.from_data({"reasoning": method}), Rigid(lambda r: "ADD()")).run([Job(Task(NUMBERS, 0))])
 
 

@@ -49,6 +49,16 @@ def test_no_prompt_changes_unseen() -> None:
 def test_the_order_of_a_prompt_is_the_declared_one() -> None:
     page = (DOCS / "prompts" / "reflexion.md").read_text(encoding="utf-8")
     prompt = page.split("````text")[1].split("````")[0]
-    marks = ["--- system ---", "You are a delivery courier", "Actions:", "Answer with", "Lessons", "Memory:", "on the clock"]
-    places = [prompt.rindex(mark) if mark in ("Memory:", "Lessons", "on the clock") else prompt.index(mark) for mark in marks]
+    marks = [
+        "--- system ---",
+        "You are a delivery courier",
+        "Actions:",
+        "Answer with",
+        "Lessons",
+        "Memory:",
+        "on the clock",
+    ]
+    places = [
+        prompt.rindex(mark) if mark in ("Memory:", "Lessons", "on the clock") else prompt.index(mark) for mark in marks
+    ]
     assert places == sorted(places)

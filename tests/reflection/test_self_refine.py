@@ -138,7 +138,7 @@ def test_a_long_feedback_does_not_cut_the_verdict() -> None:
     def critic(request: Request) -> str:
         return f"Verdict: change\n{'too slow ' * 500}" if request.tag.purpose == "feedback" else "SUB()"
 
-    trajectory, requests = play(critic, spec(max_iterations=1), steps=1)
+    _, requests = play(critic, spec(max_iterations=1), steps=1)
     assert purposes(requests) == ["act", "feedback", "refine"]
     assert "Verdict: keep" in last(requests[1]) and last(requests[1]).index("Begin with") > 0
 

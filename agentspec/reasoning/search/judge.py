@@ -22,14 +22,14 @@ _INTEGER = re.compile(r"(?<![\d.])\d+(?![\d.]*\d)")
 
 
 def last_word(text: str, values: Mapping[str, float]) -> float | None:
-    """The value of the known word that stands last in ``text``, whatever its case; ``None`` if none does."""
+    """The value of the known word that stands last in `text`, whatever its case; `None` if none does."""
     pattern = r"\b(" + "|".join(re.escape(w) for w in values) + r")\b"
     found = re.findall(pattern, visible(text)[0].casefold())
     return values[found[-1]] if found else None
 
 
 def last_number(text: str, allowed: Sequence[int]) -> int | None:
-    """The last whole number of ``text`` that is among ``allowed``; ``None`` if there is none."""
+    """The last whole number of `text` that is among `allowed`; `None` if there is none."""
     text = re.sub(r"(\d+)\s*(?:/|out of)\s*\d+", r"\1", visible(text)[0][-10_000:])  # "7/10" means 7
     found = [int(m) for m in _INTEGER.findall(text) if len(m) < 10]
     fitting = [n for n in found if n in allowed]
@@ -48,7 +48,7 @@ def last_amount(text: str, label: str) -> float | None:
 async def rate(
     meter: Meter, prompts: Sequence[Sequence[Message]], *, constrained: bool, **sampling: Any
 ) -> list[float | None]:
-    """Mean rating (0 to 1) of each prompt that ends with :data:`RATE`; ``None`` where no answer holds a number.
+    """Mean rating (0 to 1) of each prompt that ends with `RATE`; `None` where no answer holds a number.
 
     Fewer come back when the budget ends among them: the first ones.
     """

@@ -1,7 +1,7 @@
 """The budget of one decision: calls and tokens, and what happens when they run out.
 
-A method with many calls per decision asks the model through a :class:`Meter`. Questions that do not depend on each
-other are asked together (:meth:`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
+A method with many calls per decision asks the model through a `Meter`. Questions that do not depend on each
+other are asked together (`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
 end a search early: the method's own limits, the episode's budget, and a prompt that outgrew the model's context. All
 three raise `OutOfBudgetError`; the method catches it and answers with the best action it has, flagged by
 `trace["exhausted"]`. If it has none because nothing could be read, one plain question for the action follows, with what
@@ -41,11 +41,11 @@ class Meter:
 
     Args:
         llm: the module's metered model.
-        calls: most requests and scorings (``None``: no limit).
-        tokens: once this many tokens went in and out, no further request is made (``None``: no limit).
+        calls: most requests and scorings (`None`: no limit).
+        tokens: once this many tokens went in and out, no further request is made (`None`: no limit).
 
     Attributes:
-        exhausted: what ran out: ``"calls"``, ``"tokens"``, ``"episode"`` (its budget), ``"context"``, or empty.
+        exhausted: what ran out: `"calls"`, `"tokens"`, `"episode"` (its budget), `"context"`, or empty.
         answered: the first answer that proposed an action, for messages about what could not be read.
     """
 
@@ -78,7 +78,7 @@ class Meter:
         """Independent requests, made together; answers in their order.
 
         Fewer answers than requests come back when the budget ends among them: the first ones. Use those, then call
-        :meth:`stop`.
+        `stop`.
         """
         asks = asks[: self._allowed(len(asks))]
         self.calls += len(asks)
@@ -124,7 +124,7 @@ class Meter:
             raise OutOfBudgetError(str(error)) from error
 
     def _allowed(self, wanted: int) -> int:
-        """How many of ``wanted`` requests the limits leave room for."""
+        """How many of `wanted` requests the limits leave room for."""
         if self.exhausted:
             return 0
         if self._limits["tokens"] is not None and self.tokens >= self._limits["tokens"]:
@@ -136,7 +136,7 @@ class Meter:
         return max(0, min(wanted, room))
 
     def stop(self) -> None:
-        """Raise :class:`OutOfBudgetError` if something ran out."""
+        """Raise `OutOfBudgetError` if something ran out."""
         if self.exhausted:
             limit = self._limits.get(self.exhausted)
             raise OutOfBudgetError(

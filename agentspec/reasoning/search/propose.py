@@ -78,10 +78,10 @@ async def sample_steps(
     imagined: bool,
     **sampling: Any,
 ) -> list[Proposal]:
-    """``n`` samples of the next action in one request, equal ones merged, in the order they first came.
+    """`n` samples of the next action in one request, equal ones merged, in the order they first came.
 
-    Decoding is constrained to the menu where there is one and the state is not an ``imagined`` one. Every sample is
-    credited ``explored``; whoever executes one credits it anew.
+    Decoding is constrained to the menu where there is one and the state is not an `imagined` one. Every sample is
+    credited `explored`; whoever executes one credits it anew.
     """
     if schema.choices and not imagined:
         call = await meter.ask(
@@ -93,7 +93,7 @@ async def sample_steps(
 
 
 def merge(call: LLMCall, schema: ActionSchema, *, imagined: bool) -> list[Proposal]:
-    """The samples of ``call`` as proposals."""
+    """The samples of `call` as proposals."""
     found: dict[Hashable, Proposal] = {}
     for i, completion in enumerate(call.completions):
         step = read_step(completion.text, schema, imagined=imagined, cut=completion.finish_reason == "length")
@@ -110,6 +110,6 @@ def merge(call: LLMCall, schema: ActionSchema, *, imagined: bool) -> list[Propos
 
 
 def legal(text: str, schema: ActionSchema) -> Action | None:
-    """``text`` as an action of ``schema``."""
+    """`text` as an action of `schema`."""
     action = parse_action(text, schema)
     return action if isinstance(action, Action) else None

@@ -1,6 +1,6 @@
 """The two worlds a search can move in: the environment itself, and the model's idea of it.
 
-Both take a node's parent state and action to an :class:`Outcome`. The environment is exact and is put back by its
+Both take a node's parent state and action to an `Outcome`. The environment is exact and is put back by its
 user; the model predicts in words what would be observed, and whether the task would be accomplished, or over without
 that.
 """
@@ -23,9 +23,9 @@ from agentspec.types import ActionSchema, AgentInput
 
 PREDICT = (
     "Nobody acts now; imagine. What would be observed after the last step above? Write the new situation in at most "
-    "three short sentences: only what changes, and the numbers that matter. Then write two last lines: 'Earned: ' and what "
-    "this step itself would pay or cost as a number, and 'Goal: yes' if the task would be accomplished by then, 'Goal: "
-    "over' if it would have ended without that, otherwise 'Goal: no'."
+    "three short sentences: only what changes, and the numbers that matter. Then write two last lines: 'Earned: ' and "
+    "what this step itself would pay or cost as a number, and 'Goal: yes' if the task would be accomplished by then, "
+    "'Goal: over' if it would have ended without that, otherwise 'Goal: no'."
 )
 STEPS = "Steps tried in thought from here:\n{steps}"
 
@@ -43,7 +43,7 @@ class Outcome:
         schema: actions there; in an imagined state the last known ones.
         reward: reward of the step (model: 1 if the goal is reached, else 0).
         ended: nothing follows.
-        success: whether an ended state is a success; ``None`` if the world does not say.
+        success: whether an ended state is a success; `None` if the world does not say.
         earned: what the step pays in the environment's unit, as far as the world says.
     """
 
@@ -57,12 +57,12 @@ class Outcome:
 
 
 class World(Protocol):
-    """Where a search tries its steps. ``real``: in the environment itself."""
+    """Where a search tries its steps. `real`: in the environment itself."""
 
     real: bool
 
     async def step(self, node: Node) -> Outcome:
-        """What ``node``'s action leads to; the parent's ``state`` is an outcome (or the root's)."""
+        """What `node`'s action leads to; the parent's `state` is an outcome (or the root's)."""
         ...
 
 
@@ -137,7 +137,7 @@ def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:
 
 
 def render_steps(node: Node, services: Services, budget: int) -> str:
-    """The steps from the root to `node`: every action with its thought, and what was observed, within `budget` tokens."""
+    """The steps from the root to `node`: actions with their thoughts, and what was observed, within `budget`."""
     steps = [
         Step(step.action, getattr(step.note, "thought", "") or "", step.state.text if step.state is not None else "")
         for step in node.path[1:]
