@@ -136,8 +136,8 @@ def gallery() -> dict[str, str]:
     pages = {f"{name}.md": page(name, spec) for name, spec in methods().items()}
     index = "\n".join(f"- [`{name.removesuffix('.md')}`]({name})" for name in sorted(pages))
     order = (
-        "What stands in a prompt, in this order: instruction, rules and actions of the environment; how to answer; then, "
-        "in the newest user turn, lessons, memory, a method's transcript, the observation, and what is asked for."
+        "What stands in a prompt, in this order: instruction, rules and actions of the environment; how to answer; "
+        "then, in the newest user turn, lessons, memory, a method's transcript, the observation, and what is asked."
     )
     return {"README.md": f"# Prompt gallery\n\n{order}\n\n{index}\n", **pages}
 

@@ -17,7 +17,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 @pytest.mark.parametrize("name", ["direct", "react", "plan_and_solve, persistent", "react+self_refine"])
 def test_a_chat_model_delivers(name: str, menu: bool) -> None:
     spec, _ = agents()[name]
-    row = played(spec, menu=menu, max_steps=25)
+    row = played(spec, menu=menu, max_steps=50)
     assert row["invalid_share"] == 0 and row["deliveries"] >= 1
     if name in ("direct", "react") and not menu:
         assert row["calls_per_step"] == 1.0
