@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from agentspec.agent import Agent
+from agentspec.envs import environment_id, make_env
 from agentspec.llm.base import LLM, ContextOverflowError, LLMError
 from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
-from agentspec.registry import REGISTRY, SpecError
+from agentspec.registry import SpecError
 from agentspec.simulator import OBJECTS_IN_INFO, EnvironmentFailedError, simulator_of
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, jsonable, versions
@@ -28,32 +29,6 @@ from agentspec.types import Task, Transition
 
 T = TypeVar("T")
 MakeEnv = Callable[[Task], Any]
-
-
-def environment_id(name: str) -> str:
-    """The gymnasium id of a registered short name (ids pass through)."""
-    import gymnasium
-
-    import agentspec.envs  # noqa: F401  (registers our environments)
-
-    if name in gymnasium.registry:
-        return name
-    return REGISTRY.get("env", name).target
-
-
-def make_env(task: Task) -> Any:
-    """The environment of ``task`` through ``gymnasium.make``.
-
-    Raises:
-        SpecError: an unknown environment, with the nearest names, or options it does not take.
-    """
-    import gymnasium
-
-    name = environment_id(task.env)
-    try:
-        return gymnasium.make(name, disable_env_checker=True, **task.options)
-    except TypeError as error:
-        raise SpecError(f"{name} refused its options {dict(task.options)}: {error}") from error
 
 
 class EnvWorker:

@@ -136,6 +136,12 @@ register(
 
 register(
     "perception",
+    "generic",
+    "agentspec.perception.generic:GenericPerception",
+    "image, instruction, state and action schema of any environment that keeps the contract",
+)
+register(
+    "perception",
     "deliverybench",
     "agentspec.perception.deliverybench:DeliveryBenchPerception",
     "the four components of DeliveryBench: image, instruction, state, action schema",

@@ -2,7 +2,7 @@
 
 ::
 
-    perception: deliverybench
+    perception: generic
     memory: {name: base, window: 5}
     reasoning: react
     reflection: none
@@ -80,7 +80,7 @@ class AgentSpec:
     ``scope`` says whether memory lives for one ``episode`` (every episode starts empty) or for the whole ``run``.
     """
 
-    perception: ModuleSpec = ModuleSpec("deliverybench")
+    perception: ModuleSpec = ModuleSpec("generic")
     memory: ModuleSpec = ModuleSpec("none")
     reasoning: ModuleSpec = ModuleSpec("direct")
     reflection: ModuleSpec = ModuleSpec("none")

@@ -6,6 +6,7 @@ The price follows a fixed sequence that depends on the seed; SELL pays it once, 
 from __future__ import annotations
 
 import random
+import string
 import time
 from typing import Any
 
@@ -13,6 +14,7 @@ import gymnasium
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
+from agentspec.metrics import Metric
 from agentspec.state import dump_state, load_state
 from agentspec.types import ActionError, ActionSchema, ActionSpec
 
@@ -23,8 +25,13 @@ ACTIONS = {
 
 
 class ToyEnv(gymnasium.Env[dict[str, Any], str]):
-    observation_space = spaces.Dict({"text": spaces.Text(200)})
+    observation_space = spaces.Dict({"text": spaces.Text(200, charset=string.printable)})
     action_space = spaces.Text(100)
+    metadata = {  # noqa: RUF012
+        "render_modes": [],
+        "metrics": (Metric("net_earnings", "$"), Metric("deliveries")),
+        "typical_return": 25.0,  # five prices of 5 on average
+    }
 
     def __init__(self, steps: int = 5, menu: bool = False, fault: str = "", fault_step: int = 2) -> None:
         self.steps, self.menu, self.fault, self.fault_step = steps, menu, fault, fault_step
@@ -45,6 +52,8 @@ class ToyEnv(gymnasium.Env[dict[str, Any], str]):
                 raise RuntimeError("the toy broke")
             if self.fault == "hang":
                 time.sleep(30)
+        if self.t >= self.steps:
+            return self._observation(), 0.0, True, False, self._info("", False)
         parsed = parse_action(action, self._schema())
         price = self.prices[self.t]
         self.t += 1

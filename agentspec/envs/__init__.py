@@ -1,13 +1,31 @@
-"""The environments: each a versioned `gymnasium.Env`, registered when this package is imported."""
+"""The environments: each a versioned `gymnasium.Env`, registered when this package is imported.
+
+What an environment owes the scaffold stands in `agentspec.envs.contract`; `check_environment` holds one against it.
+"""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
+
+if TYPE_CHECKING:
+    from agentspec.envs.contract import ContractError, check_environment
+    from agentspec.envs.making import environment_id, make_env
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
+
+_PUBLIC = {
+    "ContractError": "agentspec.envs.contract",
+    "check_environment": "agentspec.envs.contract",
+    "environment_id": "agentspec.envs.making",
+    "make_env": "agentspec.envs.making",
+}
+
+__all__ = ["ENTRY_POINTS", "ContractError", "check_environment", "environment_id", "make_env", "register_all"]
 
 
 def register_all() -> None:
@@ -16,6 +34,15 @@ def register_all() -> None:
         if name not in gymnasium.registry:
             # The passive checker would validate every observation of every step; the test suite checks them instead.
             gymnasium.register(id=name, entry_point=entry_point, disable_env_checker=True)
+
+
+def __getattr__(name: str) -> Any:
+    """The public functions, imported when they are asked for: registering must stay cheap."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_PUBLIC[name]), name)
 
 
 register_all()

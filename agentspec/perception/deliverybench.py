@@ -1,33 +1,9 @@
-"""DeliveryBench's perception: the four components of the paper.
-
-The environment writes the instruction, the state and the text; perception decides what reaches the prompt. Images are
-passed on only when asked for, since a text policy cannot use them.
-"""
+"""DeliveryBench's perception: the generic one, under the name that specs of earlier versions use."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from agentspec.types import AgentInput, Task
+from agentspec.perception.generic import GenericPerception
 
 
-class DeliveryBenchPerception:
-    """Image, Instruction, State Info and Action Schema of a DeliveryBench observation.
-
-    Args:
-        images: pass the map picture on (for vision-language policies).
-    """
-
-    def __init__(self, images: bool = False) -> None:
-        self.images = images
-
-    def perceive(self, task: Task, observation: Mapping[str, Any], info: Mapping[str, Any]) -> AgentInput:
-        """u_t of one observation."""
-        return AgentInput(
-            instruction=info["instruction"],
-            text=observation["text"],
-            action_schema=info["action_schema"],
-            state=info["state"],
-            images=(observation["image"],) if self.images and "image" in observation else (),
-        )
+class DeliveryBenchPerception(GenericPerception):
+    """Image, Instruction, State Info and Action Schema of a DeliveryBench observation (see `GenericPerception`)."""

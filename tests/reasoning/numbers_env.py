@@ -8,6 +8,7 @@ as a success; running out of steps ends it as a failure.
 from __future__ import annotations
 
 import itertools
+import string
 from typing import Any
 
 import gymnasium
@@ -40,7 +41,7 @@ def greedy(number: int, target: int) -> str:
 
 
 class NumbersEnv(gymnasium.Env[dict[str, Any], str]):
-    observation_space = spaces.Dict({"text": spaces.Text(300)})
+    observation_space = spaces.Dict({"text": spaces.Text(300, charset=string.printable)})
     action_space = spaces.Text(100)
 
     def __init__(self, number: int = 3, target: int = 7, steps: int = 3, menu: bool = False) -> None:
@@ -53,6 +54,8 @@ class NumbersEnv(gymnasium.Env[dict[str, Any], str]):
         return self._observation(), self._info("")
 
     def step(self, action: str) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self.number == self.target or self.left <= 0:
+            return self._observation(), 0.0, True, False, self._info("")
         parsed = parse_action(action, self._schema())
         self.left -= 1
         error = parsed.message if isinstance(parsed, ActionError) else ""

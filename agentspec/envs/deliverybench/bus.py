@@ -21,6 +21,9 @@ from agentspec.envs.deliverybench.rules import Rules
 
 Point = tuple[float, float]
 
+_extending = threading.Lock()
+"""Held while a timetable grows; not a timetable's own, so that worlds can be copied and pickled."""
+
 
 @dataclass(frozen=True, slots=True)
 class BusPhase:
@@ -76,7 +79,6 @@ class BusTimetable:
         self._line = Line(names, stops, points, at)
         self._cursor = 0
         self._direction = 1
-        self._lock = threading.Lock()
         self._ticks: list[int] = []
         self._phases: list[BusPhase] = []
         if stops:
@@ -107,7 +109,7 @@ class BusTimetable:
         """Compute phases until one begins after ``tick``; worlds in several threads may share the timetable."""
         if self._ticks[-1] > tick:
             return
-        with self._lock:
+        with _extending:
             while self._ticks[-1] <= tick:
                 self._next()
 

@@ -34,6 +34,7 @@ from agentspec.envs.deliverybench.rules import Rules, rules_named
 from agentspec.envs.deliverybench.thinking import ThinkTime
 from agentspec.envs.deliverybench.view import OfferCards, describe, state_hash
 from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema
 
 CHARSET = string.printable
@@ -73,7 +74,16 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         ValueError: an argument that is none of these.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+        "metrics": (
+            Metric("hourly_profit", "$/h", summary="growth of the balance per hour of the shift"),
+            Metric("net_earnings", "$", summary="growth of the balance"),
+            Metric("deliveries", summary="orders delivered"),
+        ),
+        "typical_return": 50.0,
+    }
 
     def __init__(
         self,
@@ -165,6 +175,9 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
     def step(self, action: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one action given as text; no text raises. After the end nothing happens any more."""
         world = self.world
+        if self._truncated and not world.state.ended:  # out of steps; the world itself knows its other ends
+            observation, info = self.observe()
+            return observation, 0.0, self._terminated, self._truncated, info
         text = str(action)
         call, problem = self._native(text)
         before = Progress.of(world)

@@ -1,0 +1,87 @@
+"""From a name to an environment: registered short names, gymnasium ids, and `module:Id-v0`.
+
+An environment that keeps the contract (`agentspec.envs.contract`) is used as it is. Any other one is put behind the
+adapter of `agentspec.envs.generic`, which gives it text, a menu of its actions and the keys of `info`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any
+
+import gymnasium
+
+from agentspec.actions import suggest
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.types import Task
+
+PROVIDERS = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniworld", "ALE": "ale_py"}
+"""First part of an id -> the module that registers such ids when it is imported."""
+
+
+def environment_id(name: str) -> str:
+    """The gymnasium id of a registered short name; ids pass through, `module:Id-v0` imports the module first.
+
+    Raises:
+        SpecError: unknown, with the nearest names, or a module that is not there.
+    """
+    if name in REGISTRY.entries.get("env", {}):
+        return REGISTRY.get("env", name).target
+    module, _, plain = name.rpartition(":")
+    if plain not in gymnasium.registry:
+        module = module or PROVIDERS.get(re.split(r"[-/]", plain)[0], "")
+    if module:
+        _import(module, name)
+    if plain in gymnasium.registry:
+        return plain
+    raise SpecError(f"unknown env {name!r}{_near(plain)}")
+
+
+def make_env(task: Task) -> Any:
+    """The environment of `task`, adapted if it does not speak text.
+
+    Raises:
+        SpecError: an unknown environment, with the nearest names, options it does not take, or actions that no text
+            can name.
+    """
+    from agentspec.envs.generic import adapted
+
+    name = environment_id(task.env)
+    try:
+        env = gymnasium.make(name, disable_env_checker=True, **task.options)
+    except TypeError as error:
+        raise SpecError(f"{name} refused its options {dict(task.options)}: {error}") from error
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise SpecError(f"{name} needs a package that is not installed: {error}") from error
+    return adapted(env, name)
+
+
+def environment_class(name: str) -> Any:
+    """The class (or function) that makes an environment, or `None` if there is none of this name or it cannot load."""
+    try:
+        entry_point = gymnasium.registry[environment_id(name)].entry_point
+        if not isinstance(entry_point, str):
+            return entry_point
+        module, _, attribute = entry_point.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    except (SpecError, ImportError, AttributeError):
+        return None
+
+
+def _import(module: str, name: str) -> None:
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise SpecError(
+            f"env {name!r}: there is no module {module!r} here; install its package, or add its folder to PYTHONPATH"
+        ) from error
+
+
+def _near(name: str) -> str:
+    """A hint: the nearest of our names and of all gymnasium ids; ours alone where none is near."""
+    ours = list(REGISTRY.entries.get("env", {}))
+    hint = suggest(name, [*ours, *gymnasium.registry])
+    return hint if hint.startswith("; did you mean") else f"{suggest(name, ours)}, any gymnasium id, or module:Id-v0"
