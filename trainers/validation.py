@@ -13,9 +13,8 @@ from typing import Any
 
 from agentspec.episode import Job
 from agentspec.spec import AgentSpec
-from agentspec.trajectory import Trajectory
-from rewards import RewardSet
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 
 METRICS = (
     "net_earnings",
@@ -41,8 +40,7 @@ def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
 def validate(
     scaffolds: Mapping[str, AgentSpec],
     jobs: Sequence[Job],
-    play: Callable[[AgentSpec, Sequence[Job]], Sequence[Trajectory]],
-    rewards: RewardSet,
+    play: Callable[[AgentSpec, Sequence[Job]], Sequence[ScoredEpisode]],
     *,
     rank: int = 0,
     ranks: int = 1,
@@ -53,8 +51,7 @@ def validate(
     Args:
         scaffolds: by prefix, as of :func:`validation_scaffolds`.
         jobs: all of them; rank r plays those at r, r + ranks, ...
-        play: scaffold, jobs -> episodes.
-        rewards: what ``reward`` is, as in training.
+        play: scaffold, jobs -> episodes, scored by the training reward.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
@@ -63,7 +60,7 @@ def validate(
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
-        rows = gather([_figures(t, rewards) for t in play(spec, jobs[rank::ranks])])
+        rows = gather([_figures(episode) for episode in play(spec, jobs[rank::ranks])])
         scored = [row for row in rows if row is not None]
         metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
         for name in METRICS:
@@ -74,12 +71,12 @@ def validate(
     return metrics
 
 
-def _figures(trajectory: Trajectory, rewards: RewardSet) -> dict[str, float] | None:
-    """Numbers of one episode; ``None`` if it cannot be scored."""
-    total = rewards.total(trajectory)
-    if total is None:
+def _figures(episode: ScoredEpisode) -> dict[str, float] | None:
+    """Numbers of one episode; `None` if it failed."""
+    if episode.score is None:
         return None
-    return {"reward": total} | {n: float(trajectory.metrics[n]) for n in METRICS if n in trajectory.metrics}
+    metrics = episode.trajectory.metrics
+    return {"reward": episode.score.total} | {n: float(metrics[n]) for n in METRICS if n in metrics}
 
 
 def _mean(values: Sequence[float]) -> float:
