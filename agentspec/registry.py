@@ -135,6 +135,13 @@ register(
 )
 
 register(
+    "env",
+    "minigrid",
+    "agentspec/MiniGrid-v0",
+    "MiniGrid and BabyAI grids: egocentric text, success within 100 steps, the paper's ten tasks",
+)
+
+register(
     "perception",
     "generic",
     "agentspec.perception.generic:GenericPerception",
@@ -187,14 +194,14 @@ register(
     "rule_based",
     "agentspec.reasoning.rule_based:RuleBased",
     "the environment's scripted expert: no model, a baseline and demonstrator",
-    envs=("deliverybench",),
+    envs=("deliverybench", "minigrid"),
 )
 register(
     "reasoning",
     "random",
     "agentspec.reasoning.rule_based:RandomLegal",
     "a random sensible action: no model, the floor",
-    envs=("deliverybench",),
+    envs=("deliverybench", "minigrid"),
 )
 register(
     "reasoning",

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    "agentspec/MiniGrid-v0": "agentspec.envs.minigrid.env:MiniGridEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
 

@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import minigrid  # noqa: F401  (registers its environments)
@@ -27,6 +27,7 @@ from agentspec.actions import parse_action
 from agentspec.envs.minigrid.search import ACTIONS, optimum
 from agentspec.envs.minigrid.suites import Layout, layout_of
 from agentspec.envs.minigrid.view import TEXTS, Thing, View, compact, look
+from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema, ActionSpec
 
 TILE = 28
@@ -81,7 +82,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
     """One grid, one mission.
 
     Args:
-        suite, id, task: what is played, one of the three (see `suites.layout_of`); default the suite `paper`.
+        suite, level, task: what is played, one of the three (see `suites.layout_of`); default the suite `paper`.
         observation: `compact`, `basic` or `relational` text (see `view`).
         action_mode: `native` calls such as `TURN_LEFT()`, or a `menu` of seven phrases.
         max_steps: actions after which an episode is truncated (the paper's 100, whatever MiniGrid's own limit).
@@ -92,13 +93,26 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         ValueError: an argument that is none of these.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": 4,
+        "metrics": (
+            Metric("success", summary="whether the mission was fulfilled (0 or 1)"),
+            Metric("efficiency", summary="success * L* / max(steps, L*), L* the fewest actions that solve the layout"),
+            Metric("reward", summary="MiniGrid's own: 1 - 0.9 * steps / max_steps on success, else 0"),
+        ),
+        "typical_return": 1.0,
+    }
+    experts: ClassVar[dict[str, str]] = {
+        "rule_based": "agentspec.envs.minigrid.expert:expert",
+        "random": "agentspec.envs.minigrid.expert:luck",
+    }
 
     def __init__(
         self,
         *,
         suite: str = "",
-        id: str = "",
+        level: str = "",
         task: str = "",
         observation: Literal["compact", "basic", "relational"] = "relational",
         action_mode: Literal["native", "menu"] = "native",
@@ -106,15 +120,15 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         images: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        if not (suite or id or task):
+        if not (suite or level or task):
             suite = "paper"
-        layout_of(suite=suite, id=id, task=task)
+        layout_of(suite=suite, level=level, task=task)
         _check("observation", observation, tuple(TEXTS))
         _check("action_mode", action_mode, ("native", "menu"))
         _check("render_mode", render_mode, (None, "rgb_array"))
         if max_steps < 1:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
-        self._choice = {"suite": suite, "id": id, "task": task}
+        self._choice = {"suite": suite, "level": level, "task": task}
         self._word = TEXTS[observation]
         self.max_steps = max_steps
         self.images = images
@@ -268,8 +282,8 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         world, last, layout = self.world, self._last, self.layout
         assert layout is not None
         success = self._return > 0
-        metrics: dict[str, Any] = {"success": float(success), "reward": self._return}
-        if self._ended:
+        metrics: dict[str, Any] = {"success": float(success), "efficiency": None, "reward": self._return}
+        if self._terminated or self._truncated:
             metrics |= self._efficiency(layout) if success else {"efficiency": 0.0}
         return {
             "instruction": self.instruction,
@@ -282,12 +296,14 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
                 "affordances": list(view.affordances),
                 "in_view": [{"name": t.name, "forward": t.forward, "right": t.right} for t in view.things],
                 "steps_left": self.max_steps - int(world.step_count),
+                "layout": {"id": layout.id, "seed": layout.seed, "name": layout.name},
+                "history": list(self._history),
             },
             "error": last.error,
             "error_code": last.code,
             "message": last.message,
             "invalid": bool(last.error),
-            "layout": {"id": layout.id, "seed": layout.seed, "name": layout.name},
+            "success": success,
             "metrics": metrics,
         }
 

@@ -50,27 +50,27 @@ SUITES: Mapping[str, tuple[str, ...]] = {
 """Suite -> the registered ids it cycles through."""
 
 
-def layout_of(*, suite: str = "", id: str = "", task: str = "", seed: int = 0) -> Layout:
+def layout_of(*, suite: str = "", level: str = "", task: str = "", seed: int = 0) -> Layout:
     """The grid of an episode.
 
     Args:
         suite: one of `SUITES`; the episode's `seed` selects the id, and except for `paper` the layout.
-        id: a registered MiniGrid or BabyAI id; `seed` is the layout's.
+        level: a registered MiniGrid or BabyAI id; `seed` is the layout's.
         task: name of one of the paper's ten tasks; `seed` does not matter.
 
     Raises:
         ValueError: none of the three, several of them, or an unknown one.
     """
-    given = [name for name, value in (("suite", suite), ("id", id), ("task", task)) if value]
+    given = [name for name, value in (("suite", suite), ("level", level), ("task", task)) if value]
     if len(given) != 1:
-        raise ValueError(f"got {' and '.join(given) or 'neither suite, id nor task'}; expected one of suite, id, task")
+        raise ValueError(f"got {' and '.join(given) or 'neither suite, level nor task'}; expected one of suite, level, task")
     if task:
         named = {layout.name: layout for layout in PAPER}
         if task not in named:
             raise ValueError(f"unknown task {task!r}{suggest(task, named)}; expected one of {', '.join(named)}")
         return named[task]
-    if id:
-        return Layout(_registered(id), seed)
+    if level:
+        return Layout(_registered(level), seed)
     if suite not in SUITES:
         raise ValueError(f"unknown suite {suite!r}{suggest(suite, SUITES)}; expected one of {', '.join(SUITES)}")
     if suite == "paper":
@@ -79,12 +79,12 @@ def layout_of(*, suite: str = "", id: str = "", task: str = "", seed: int = 0) -
     return Layout(ids[seed % len(ids)], seed)
 
 
-def _registered(id: str) -> str:
-    """`id`, which must be one that MiniGrid registers."""
+def _registered(level: str) -> str:
+    """`level`, which must be one that MiniGrid registers."""
     import gymnasium
     import minigrid  # noqa: F401  (registers its environments)
 
     known = [name for name in gymnasium.registry if name.startswith(("MiniGrid-", "BabyAI-"))]
-    if id not in known:
-        raise ValueError(f"unknown grid {id!r}{suggest(id, known)}; expected a registered MiniGrid or BabyAI id")
-    return id
+    if level not in known:
+        raise ValueError(f"unknown level {level!r}{suggest(level, known)}; expected a registered MiniGrid or BabyAI id")
+    return level
