@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from agentspec.state import write_atomic
+from agentspec.files import write_atomic
 from trainers.estimators import ESTIMATORS
 from trainers.losses import LOSSES, REFUSED
 

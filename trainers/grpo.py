@@ -41,7 +41,7 @@ from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
-from trainers.vllm import vllm_round
+from trainers.vllm import prepare_vllm, vllm_round
 
 
 class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
@@ -66,6 +66,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         **kwargs: Any,
     ) -> None:
         args.check()
+        prepare_vllm(args)
         self.rewards_used = args.reward_set
         self.credit_rule = CreditRule.from_config(args)
         self._played: list[ScoredEpisode] = []
