@@ -22,14 +22,14 @@ from agentspec.actions import suggest
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
+from agentspec.metrics import episode_row
+from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tasks import Tasks, task_sets
 from agentspec.trajectory import Trajectory, jsonable, write_trajectories
 from agentspec.types import Sampling, Task
-from eval.metrics import episode_row
-from eval.policies import Policy
 from eval.results import Results
-from eval.tasks import Tasks, task_sets
 
 MakeLLM = Callable[[Policy], LLM | None]
 
@@ -101,7 +101,7 @@ def evaluate(
     on_row: Callable[[dict[str, Any]], None] | None = None,
     **changes: Any,
 ) -> list[dict[str, Any]]:
-    """Play policies x scaffolds x tasks and return one row per episode (see :func:`eval.metrics.episode_row`).
+    """Play policies x scaffolds x tasks and return one row per episode (see :func:`agentspec.metrics.episode_row`).
 
     Args:
         policies: rows of the matrix; names must differ.

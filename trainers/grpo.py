@@ -20,6 +20,7 @@ from trl import GRPOTrainer
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
@@ -322,11 +323,10 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
 
     def _log_episodes(self) -> None:
         """Scaffold metrics of this rank's episodes, and the trajectories themselves."""
-        scored = [t for t in self._episodes if t.scorable]
-        for name in ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries"):
-            values = [float(t.metrics[name]) for t in scored if name in t.metrics]
-            if values:
-                self._metrics["train"][f"episode/{name}"].append(sum(values) / len(values))
+        scored = [figures(t) for t in self._episodes if t.scorable]
+        for name in dict.fromkeys(name for row in scored for name in row):
+            values = [row[name] for row in scored if name in row]
+            self._metrics["train"][f"episode/{name}"].append(sum(values) / len(values))
         self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
 
     def _log_update(self, rows: Sequence[Row]) -> None:

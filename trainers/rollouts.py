@@ -14,24 +14,12 @@ from typing import Any
 
 from agentspec.episode import Job, Runner
 from agentspec.llm.recorder import derive_seed
+from agentspec.tasks import TEST_SEEDS, make_tasks
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from rewards import RewardSet
 
-TEST_SEEDS = 20_000
-"""Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
-
-
-def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "train", first: int = 0) -> list[Task]:
-    """``count`` tasks of one environment with consecutive seeds.
-
-    Raises:
-        ValueError: training seeds that reach into the held-out range.
-    """
-    base = {"train": 0, "validation": 10_000, "test": TEST_SEEDS}[split] + first
-    if split == "train" and base + count > 10_000:
-        raise ValueError(f"training seeds {base}..{base + count - 1} reach the held-out range; use fewer than 10,000")
-    return [Task(env, base + i, options, split) for i in range(count)]
+__all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "task_of", "task_rows"]
 
 
 def task_rows(tasks: Sequence[Task]) -> list[dict[str, Any]]:

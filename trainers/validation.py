@@ -12,22 +12,11 @@ from dataclasses import replace
 from typing import Any
 
 from agentspec.episode import Job
+from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from rewards import RewardSet
 from trainers.config import ScaffoldConfig
-
-METRICS = (
-    "net_earnings",
-    "success",
-    "deliveries",
-    "steps",
-    "invalid_actions",
-    "llm_calls",
-    "input_tokens",
-    "output_tokens",
-)
-"""Figures of an episode that are logged where the environment or the scaffold reports them."""
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
@@ -58,18 +47,17 @@ def validate(
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
-        ``PREFIXreward`` (the training reward per episode), those of :data:`METRICS` that episodes report, and
-        ``PREFIXunscorable``, the share of episodes that failed; means leave these out. ``reward`` is NaN if all failed.
+        ``PREFIXreward`` (the training reward per episode), the figures that the environment declares and the scaffold's
+        (`agentspec.metrics.figures`), and ``PREFIXunscorable``, the share of episodes that failed; means leave these
+        out. ``reward`` is NaN if all failed.
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
         rows = gather([_figures(t, rewards) for t in play(spec, jobs[rank::ranks])])
         scored = [row for row in rows if row is not None]
         metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
-        for name in METRICS:
-            values = [row[name] for row in scored if name in row]
-            if values:
-                metrics[f"{prefix}{name}"] = _mean(values)
+        for name in dict.fromkeys(name for row in scored for name in row if name != "reward"):
+            metrics[f"{prefix}{name}"] = _mean([row[name] for row in scored if name in row])
         metrics[f"{prefix}unscorable"] = 1 - len(scored) / len(rows)
     return metrics
 
@@ -79,7 +67,7 @@ def _figures(trajectory: Trajectory, rewards: RewardSet) -> dict[str, float] | N
     total = rewards.total(trajectory)
     if total is None:
         return None
-    return {"reward": total} | {n: float(trajectory.metrics[n]) for n in METRICS if n in trajectory.metrics}
+    return figures(trajectory) | {"reward": total}
 
 
 def _mean(values: Sequence[float]) -> float:

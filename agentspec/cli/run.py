@@ -23,7 +23,10 @@ from agentspec.trajectory import Trajectory, write_trajectories
 from agentspec.types import Task
 
 if TYPE_CHECKING:
-    from eval.policies import Policy
+    from agentspec.policies import Policy
+
+UNTOLD = ("input_tokens_per_step", "output_tokens_per_step", "calls_per_step", "cost")
+"""Figures that the line about a finished episode leaves out."""
 
 
 def add_parser(commands: Any) -> None:
@@ -101,7 +104,7 @@ def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
     Raises:
         SpecError: the spec calls a model and none was named.
     """
-    from eval.policies import needs_model
+    from agentspec.policies import needs_model
 
     spec = AgentSpec.from_yaml(arguments.spec) if arguments.spec else AgentSpec()
     if arguments.sampling:
@@ -124,19 +127,18 @@ def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
 
 def _print_outcome(trajectory: Trajectory) -> None:
     """One line about a finished episode."""
-    from eval.metrics import BY_NAME, episode_row
+    from agentspec.metrics import columns, episode_row
 
     row = episode_row(trajectory)
     if not trajectory.scorable:
         return
-    names = ("net_earnings", "hourly_profit", "success", "deliveries", "steps", "invalid_share", "thinking_s_per_step")
-    parts = [f"{BY_NAME[n].heading} {row[n]:.{BY_NAME[n].digits}f}" for n in names if row.get(n) is not None]
+    parts = [f"{m.heading} {m.show(row[m.name])}" for m in columns([row]) if m.name not in UNTOLD]
     print(f"seed {trajectory.task.seed}: {', '.join(parts)} (ended by {row['ended']})", flush=True)
 
 
 def _print_json(trajectories: Sequence[Trajectory]) -> None:
     """With several episodes a line for each; the last line is the outcome, or the mean over unfailed episodes."""
-    from eval.metrics import outcome
+    from agentspec.metrics import outcome
 
     outcomes = [outcome(t) for t in trajectories]
     if len(outcomes) == 1:

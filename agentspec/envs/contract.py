@@ -3,8 +3,8 @@
 An environment is a `gymnasium.Env` that speaks text:
 
 - `observation` is a mapping with `text`: the dynamic part of the prompt. It may hold `image`, `uint8` (H, W, 3).
-- `step(action)` takes any text. A text that is no action, or an action that cannot be done now, is a step like any other:
-  nothing raises, `info["invalid"]` is set and `info["error"]` says what to write instead.
+- `step(action)` takes any text. A text that is no action, or an action that cannot be done now, is a step like any
+  other: nothing raises, `info["invalid"]` is set and `info["error"]` says what to write instead.
 - `info` holds the keys of `INFO_KEYS`, from `reset` on.
 - `reset(seed=s)` and the same texts give the same episode, whatever was played before. After the end, `step` changes
   nothing.
@@ -182,7 +182,7 @@ def _refuses(env: Any, seed: int, steps: int) -> Iterator[str]:
     for text in NONSENSE:
         _, _, terminated, truncated, info = env.step(text)
         if not info.get("invalid") or not info.get("error"):
-            yield f"the text {text!r} is no action; expected info['invalid'] and an info['error'] that says what to write"
+            yield f"the text {text!r} is no action; expected info['invalid'] and an info['error'] with what to write"
         if terminated or truncated:
             return
 
@@ -327,7 +327,8 @@ def _differences(mine: list[_Report], theirs: list[_Report], what: str) -> Itera
         different = [name for name, (left, right) in pairs.items() if left != right]
         if different:
             name = different[0]
-            yield f"{what}, step {number} differs in {', '.join(different)}: {pairs[name][0]!r} became {pairs[name][1]!r}"
+            before, after = pairs[name]
+            yield f"{what}, step {number} differs in {', '.join(different)}: {before!r} became {after!r}"
             return
 
 

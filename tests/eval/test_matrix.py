@@ -12,13 +12,13 @@ import pytest
 
 from agentspec.episode import make_env
 from agentspec.llm.scripted import ScriptedLLM
+from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tasks import task_sets
 from agentspec.trajectory import read_trajectories
 from agentspec.types import Task
 from eval.matrix import evaluate
-from eval.policies import Policy
-from eval.tasks import task_sets
 from tests.toy_env import TOY
 
 PLAIN = AgentSpec()

@@ -17,6 +17,7 @@ from recipes.learning_study import check, gains
 def rows(policy: str, scaffold: str, values: list[float]) -> list[dict[str, object]]:
     return [
         {
+            "env": "deliverybench",
             "policy": policy,
             "scaffold": scaffold,
             "tasks": "t",
