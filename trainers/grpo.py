@@ -18,6 +18,8 @@ from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
 
+from agentspec.carry import FILE as MEMORY_FILE
+from agentspec.carry import MemoryBank, save_bank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.metrics import figures
@@ -29,7 +31,7 @@ from trainers.call_metrics import CallMetrics, clipped_tokens
 from trainers.config import ScaffoldConfig
 from trainers.distributed import KnownLayout, check_trained
 from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
-from trainers.rollouts import collect, rollout_jobs, task_of
+from trainers.rollouts import collect, rollout_jobs, starting_states, task_of
 from trainers.runlog import RunLog, transcript
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
@@ -80,7 +82,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         self._make_llm = make_llm or partial(local_llm, batching=args.batching)
         self._llm: LLM | None = None
         self._round = 0
-        self._memory: bytes | None = None
+        self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
@@ -213,15 +215,18 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         check_trained(self._episodes, self.args, gather_object)
 
     def _carried_memory(self) -> bytes | None:
-        """With ``scope: run``: the memory that the next round starts from, the same on every rank."""
+        """With ``scope: run``: the bank of memories that the next round starts from, the same on every rank.
+
+        Each task carries the memory of one of its own rollouts. The main process keeps the bank as ``memory.json``.
+        """
         if self.args.spec.scope != "run":
             return None
-        local = [(self.rewards_used.total(t), t.memory_state) for t in self._episodes]
-        scored = [(value, state) for value, state in gather_object(local) if value is not None]
-        if not scored:
-            return self._memory
-        state: bytes | None = (scored[0] if self.args.memory_carry == "first" else max(scored, key=lambda s: s[0]))[1]
-        return state
+        bank = MemoryBank.of_spec(self.args.spec) if self._memory is None else MemoryBank.load(self._memory)
+        played = [(t.task.key, self.rewards_used.total(t), t.memory_state) for t in self._episodes]
+        bank = bank.carried(gather_object(played), self.args.memory_carry)
+        if self.accelerator.is_main_process:
+            save_bank(self.run_log.folder / MEMORY_FILE, bank)
+        return bank.dump()
 
     # --- updates -----------------------------------------------------------------------------------------------------
 
@@ -373,12 +378,14 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             metric_key_prefix: stands before every metric's name.
         """
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
+        tasks = [task_of(row) for row in rows]
+        states = starting_states(tasks, self._memory, unseen=True)
         training = self.model.training
         self.model.eval()
         with self._current_weights():
             metrics = validate(
                 validation_scaffolds(self.args),
-                [Job(task_of(row), 0, self.args.seed, self._memory) for row in rows],
+                [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
                 lambda spec, jobs: self._play(jobs, spec),
                 self.rewards_used,
                 rank=self.accelerator.process_index,

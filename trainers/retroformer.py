@@ -80,6 +80,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
         )
     if spec.reflection.params.get("temperature") == 0:
         raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
+    if config.start_memory:
+        raise SpecError("start_memory: lessons are about first trials, which start from nothing; leave it out")
     if config.train_calls != [PATH]:
         raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
     if REWARD not in config.reward_set.weights:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from agentspec.carry import MemoryBank
 from agentspec.episode import Job, Runner
 from agentspec.llm.recorder import derive_seed
 from agentspec.tasks import TEST_SEEDS, make_tasks
@@ -19,7 +20,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from rewards import RewardSet
 
-__all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "task_of", "task_rows"]
+__all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "starting_states", "task_of", "task_rows"]
 
 
 def task_rows(tasks: Sequence[Task]) -> list[dict[str, Any]]:
@@ -52,10 +53,29 @@ def rollout_jobs(
         round: number of the generation round; another round samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
-        memory: state that memories with ``scope: run`` start from; all rollouts of a round start alike.
+        memory: the run's `agentspec.carry.MemoryBank` as bytes (with ``scope: run``): all rollouts of a task start
+            from that task's state.
     """
     run_seed = derive_seed(seed, round)
-    return [Job(task_of(row), (first + i) % group, run_seed, memory) for i, row in enumerate(rows)]
+    tasks = [task_of(row) for row in rows]
+    states = starting_states(tasks, memory)
+    return [
+        Job(t, (first + i) % group, run_seed, state) for i, (t, state) in enumerate(zip(tasks, states, strict=True))
+    ]
+
+
+def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool = False) -> list[bytes | None]:
+    """What an episode of each task starts from, out of a run's memory.
+
+    Args:
+        tasks: in order.
+        memory: a `MemoryBank` as bytes; ``None``: nothing is carried.
+        unseen: tasks that the run does not train on: without a state of their own they start from the latest.
+    """
+    if memory is None:
+        return [None] * len(tasks)
+    bank = MemoryBank.load(memory)
+    return [(bank.as_start() if unseen else bank).of(task) for task in tasks]
 
 
 def collect(

@@ -55,6 +55,9 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--seed", type=int, default=0, help="seed of the agents' own draws")
     group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
     group.add_argument(
+        "--start-memory", default="", metavar="FILE|DIR", help="memory that a run left, for scaffolds with scope: run"
+    )
+    group.add_argument(
         "--sampling", action="append", default=[], metavar="KEY=VALUE", help="sampling (default: temperature=0)"
     )
     group = parser.add_argument_group("output")
@@ -83,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         max_steps=arguments.max_steps,
         prices=load_prices(arguments.prices),
         trajectories=arguments.trajectories,
+        start_memory=arguments.start_memory,
         retry_failed=arguments.retry_failed,
         replace_stale=arguments.replace_stale,
     )

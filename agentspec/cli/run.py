@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agentspec.cli.arguments import (
@@ -51,8 +52,15 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--seed", type=int, default=0, help="seed of the first episode's task (default: %(default)s)")
     group.add_argument("--episodes", type=int, default=1, metavar="N", help="tasks with consecutive seeds")
     group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group.add_argument(
+        "--start-memory", default="", metavar="FILE|DIR", help="start from a memory that a run left (scope: run)"
+    )
     group = parser.add_argument_group("output")
-    group.add_argument("--out", metavar="FILE", help="write the trajectories, one JSON line each")
+    group.add_argument(
+        "--out",
+        metavar="FILE",
+        help="write the trajectories, one JSON line each; with `scope: run` the memory beside it",
+    )
     group.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
     group.add_argument("--json", action="store_true", help="print JSON; the last line has the (mean) outcome")
     parser.set_defaults(command=run)
@@ -60,6 +68,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Play, print, write; exit code 1 if an episode failed."""
+    from agentspec.carry import run_in_order, save_bank, start_bank
     from agentspec.cli.frames import Film
     from agentspec.episode import Job, Runner, environment_id, make_env
 
@@ -73,19 +82,26 @@ def run(arguments: argparse.Namespace) -> int:
     tasks = [Task(arguments.env, arguments.seed + i, options, "test") for i in range(arguments.episodes)]
     # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
     make_env(tasks[0]).close()
+    start = start_bank(arguments.start_memory, spec)
     film = Film(arguments.gif, tasks[0]) if arguments.gif else None
     runner = Runner(
         spec,
         policy.build() if policy else None,
         make_env=film.make_env if film else make_env,
-        concurrency=1 if spec.scope == "run" else arguments.concurrency,
+        concurrency=arguments.concurrency,
         timeout_s=arguments.timeout,
         max_steps=arguments.max_steps,
         prices=load_prices(arguments.prices),
         policy=policy.name if policy else spec.reasoning.name,
         on_done=None if arguments.json else _print_outcome,
     )
-    trajectories = runner.run([Job(task) for task in tasks])
+    jobs = [Job(task) for task in tasks]
+    if spec.scope == "run":
+        trajectories, bank = run_in_order(runner, jobs, start)
+        if arguments.out:
+            save_bank(Path(arguments.out).with_suffix(".memory.json"), bank)
+    else:
+        trajectories = runner.run(jobs)
     if arguments.out:
         write_trajectories(arguments.out, trajectories)
     failed = [t for t in trajectories if not t.scorable]
