@@ -2,7 +2,8 @@
 
 Episodes are asyncio tasks on one loop; each owns its agent, its recorder and a worker thread in which its environment
 runs under a time limit. Nothing is shared, so results do not depend on how many run at once. An environment that
-crashes, hangs or pays NaN makes its own episode ``failed`` and touches no other.
+crashes, hangs or pays NaN makes its own episode ``failed`` and touches no other; so does a module that raises. Only a
+specification that cannot work and a defect of the backend itself end the run.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ import asyncio
 import math
 import queue
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from agentspec.agent import Agent
@@ -196,8 +199,8 @@ class Runner:
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)
-        except (EnvironmentFailedError, LLMError) as caught:
-            status, error, ended = "failed", str(caught), "failure"
+        except Exception as caught:
+            status, error, ended = "failed", _failure(caught, agent), "failure"
         finally:
             if env is not None and status == "completed":
                 await worker.call("close", env.close)
@@ -206,10 +209,8 @@ class Runner:
         if status == "completed":
             try:
                 await agent.end_episode(trajectory)
-            except ContextOverflowError as caught:
-                error = str(caught)  # too long to be reflected on; what was played stands
-            except LLMError as caught:
-                status, error, ended = "failed", str(caught), "failure"
+            except Exception as caught:
+                status, error, ended = "failed", _failure(caught, agent), "failure"
             metrics |= _scaffold_metrics(transitions, agent.recorder, ended) | jsonable(agent.metrics())
             trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         return trajectory
@@ -243,15 +244,14 @@ async def _step(
     task: Task, agent: Agent, env: Any, worker: EnvWorker, observation: Any, info: dict[str, Any]
 ) -> tuple[Transition | None, Any, dict[str, Any]]:
     """Decide and act once; no transition when the budget is exhausted."""
-    before = len(agent.recorder.calls)
     agent_input, decision = await agent.decide(task, observation, info)
     if "budget" in decision.trace:
         return None, observation, info
     text = decision.action.text
     deliberate = getattr(getattr(env, "unwrapped", env), "deliberate", None)
     if callable(deliberate):
-        # Environments that charge for thinking are told what the decision took.
-        calls = agent.recorder.calls[before:]
+        # Environments that charge for thinking are told of every call since the step before, memory's included.
+        calls = agent.uncharged()
         tokens = sum(call.usage.output_tokens for call in calls)
         await worker.call("deliberate", lambda: deliberate(len(calls), tokens))
     observation, reward, terminated, truncated, info = await worker.call("step", lambda: env.step(text))
@@ -271,6 +271,21 @@ async def _step(
     return transition, observation, info
 
 
+def _failure(error: Exception, agent: Agent) -> str:
+    """Why an episode failed: its environment, its model, or a module that raised (with the place where).
+
+    Raises:
+        Exception: `error` itself, where it is a specification that cannot work or a defect of the backend.
+    """
+    if isinstance(error, EnvironmentFailedError | LLMError):
+        return str(error)
+    if isinstance(error, SpecError) or error is agent.recorder.backend_error:
+        raise error
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(frame.filename).name}:{frame.lineno}, in {frame.name}: {frame.line}"
+    return f"a module raised {type(error).__name__}: {error} ({where})"
+
+
 def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, ended: str) -> dict[str, Any]:
     """What the scaffold adds to the environment's figures; ``thinking_s`` is wall-clock time of the model calls."""
     usage, steps = recorder.usage, len(transitions)
@@ -287,6 +302,7 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "cached_tokens": usage.cached_tokens,
         "cost": usage.cost,
         "thinking_s": sum(c.latency_s for c in recorder.calls),
+        "problems": sum(recorder.problems.values()),
         "ended": ended,
     }
 

@@ -1,6 +1,6 @@
 """What a module must offer, and what it is given.
 
-A module is built once per episode with its :class:`Services` and its own keyword parameters. Everything it may use from
+A module is built once per episode with its `Services` and its own keyword parameters. Everything it may use from
 outside comes with the services, so that a rollout is reproducible: no module reads the wall clock, global randomness
 or uuids. Methods that may call the model are ``async``. State that outlives an episode (``scope: run``) travels as the
 ``snapshot()`` of one instance restored into the next, never as a shared object.
@@ -8,21 +8,34 @@ or uuids. Methods that may call the model are ``async``. State that outlives an 
 
 from __future__ import annotations
 
-import itertools
-import random
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agentspec.services import Answer, Services, StepClock, Time
 from agentspec.types import AgentInput, Decision, Recall, Task, Transition
 
 if TYPE_CHECKING:
-    from agentspec.context import Context
-    from agentspec.llm.recorder import ModuleLLM
     from agentspec.trajectory import Trajectory
+
+__all__ = [
+    "Answer",
+    "Embedder",
+    "Measured",
+    "Memory",
+    "Perception",
+    "Reasoning",
+    "Reflection",
+    "Services",
+    "Simulated",
+    "Simulator",
+    "Stateful",
+    "StepClock",
+    "Time",
+]
 
 
 class Embedder(Protocol):
@@ -31,16 +44,6 @@ class Embedder(Protocol):
     dim: int
 
     def embed(self, texts: list[str]) -> NDArray[np.float32]: ...
-
-
-class StepClock:
-    """Time in environment steps of the current episode."""
-
-    def __init__(self) -> None:
-        self.step = 0
-
-    def __call__(self) -> int:
-        return self.step
 
 
 @dataclass(frozen=True)
@@ -73,29 +76,6 @@ class Simulator(Protocol):
     async def step(self, action: str) -> Simulated: ...
 
 
-@dataclass
-class Services:
-    """What the scaffold injects into a module.
-
-    Args:
-        llm: the metered model, bound to the module's name.
-        context: the running conversation of the episode (shared by the modules of one agent).
-        clock: environment steps since the episode began.
-        rng: the module's own generator, seeded by run, task, rollout and module.
-        embedder: text embeddings, or ``None`` where the spec names no embedder.
-        new_id: counter for ids, unique within the module.
-        simulator: the environment for search, or ``None`` where it has no snapshots.
-    """
-
-    llm: ModuleLLM
-    context: Context
-    clock: Callable[[], int]
-    rng: random.Random
-    embedder: Embedder | None = None
-    new_id: Callable[[], int] = field(default_factory=lambda: itertools.count().__next__)
-    simulator: Simulator | None = None
-
-
 class Perception(Protocol):
     """Observation -> u_t."""
 
@@ -111,7 +91,11 @@ class Stateful(Protocol):
 
 
 class Memory(Stateful, Protocol):
-    """What is remembered, within an episode or across episodes."""
+    """What is remembered, within an episode or across episodes.
+
+    `store` is told of every step, the last one included, and what it asks the model belongs to the step after.
+    `end_episode` may write what the next episodes shall know.
+    """
 
     def begin_episode(self, task: Task) -> None: ...
 

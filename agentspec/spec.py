@@ -16,6 +16,7 @@ Change one line and the same policy runs, trains or is evaluated inside another 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import random
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ from typing import Any, Literal
 import yaml
 
 from agentspec.actions import suggest
-from agentspec.context import Context, Layout
+from agentspec.context import Context, Layout, Placement
 from agentspec.llm.recorder import Budget, ModuleLLM, Recorder, derive_seed
 from agentspec.protocols import Embedder, Services, StepClock
 from agentspec.registry import REGISTRY, SpecError
@@ -77,7 +78,9 @@ def _parameters(target: Any) -> list[str]:
 class AgentSpec:
     """One agent: four modules, the prompt layout, sampling defaults and a budget per episode.
 
-    ``scope`` says whether memory lives for one ``episode`` (every episode starts empty) or for the whole ``run``.
+    `scope` says whether memory lives for one `episode` (every episode starts empty) or for the whole `run`. What is
+    recalled has at most `recall_tokens` tokens in a step, lessons of a reflector `lesson_tokens`; with `recall: newest`
+    both stand in the newest user turn only, with `recall: kept` in every turn (see :mod:`agentspec.context`).
     """
 
     perception: ModuleSpec = ModuleSpec("generic")
@@ -87,6 +90,9 @@ class AgentSpec:
     layout: Layout = "conversation"
     max_turns: int = 0
     scope: Literal["episode", "run"] = "episode"
+    recall: Placement = "newest"
+    recall_tokens: int = 512
+    lesson_tokens: int = 256
     embedder: str = ""
     sampling: Sampling = Sampling()
     budget: Budget = Budget()
@@ -118,6 +124,8 @@ class AgentSpec:
             raise SpecError(f"layout must be 'conversation' or 'snapshot', got {spec.layout!r}")
         if spec.scope not in ("episode", "run"):
             raise SpecError(f"scope must be 'episode' or 'run', got {spec.scope!r}")
+        if spec.recall not in ("newest", "kept"):
+            raise SpecError(f"recall must be 'newest' or 'kept', got {spec.recall!r}")
         return spec
 
     @classmethod
@@ -129,6 +137,7 @@ class AgentSpec:
         """Plain data that :meth:`from_data` reads back to an equal spec; defaults of sampling and budget left out."""
         data: dict[str, Any] = {kind: getattr(self, kind).to_data() for kind in MODULE_KINDS}
         data |= {k: getattr(self, k) for k in ("layout", "max_turns", "scope", "embedder")}
+        data |= {k: getattr(self, k) for k in ("recall", "recall_tokens", "lesson_tokens")}
         for key in ("sampling", "budget"):
             value, default = getattr(self, key), type(getattr(self, key))()
             fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
@@ -178,9 +187,19 @@ class AgentSpec:
         """A fresh :class:`~agentspec.agent.Agent` for one episode, its modules wired to ``recorder``."""
         from agentspec.agent import Agent
 
-        context, clock = Context(self.layout, self.max_turns), StepClock()
+        clock = StepClock()
+        context = Context(
+            self.layout,
+            self.max_turns,
+            recall=self.recall,
+            recall_tokens=self.recall_tokens,
+            lesson_tokens=self.lesson_tokens,
+            count_tokens=recorder.llm.count_tokens,
+            window=recorder.llm.max_context,
+        )
         modules: dict[str, Any] = {}
         provided: list[Services] = []
+        names: dict[str, str] = {}
         for kind in MODULE_KINDS:
             spec: ModuleSpec = getattr(self, kind)
             cls = REGISTRY.get(kind, spec.name).load()
@@ -189,9 +208,11 @@ class AgentSpec:
                 continue
             path = f"{kind}.{spec.name}"
             rng = random.Random(derive_seed(recorder.seed, path))
-            provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder=embedder))
+            names[kind] = path
+            new_id = functools.partial(clock.new_id, path)
+            provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder, new_id))
             modules[kind] = cls(provided[-1], **spec.params)
-        return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), **modules)
+        return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
 
 
 _FIELDS = [f.name for f in dataclasses.fields(AgentSpec)]
@@ -221,7 +242,7 @@ def load_yaml(source: str | Path) -> Any:
     """
     text = str(source)
     is_text = isinstance(source, str) and ("\n" in text or ":" in text)
-    if not is_text or Path(text).is_file():
+    if not is_text or ("\n" not in text and Path(text).is_file()):
         path = Path(source)
         if not path.is_file():
             raise SpecError(f"no such YAML file: {path}; give a path to an existing file")

@@ -1,8 +1,13 @@
-"""Token sequences: what two of them have in common."""
+"""Tokens: what two sequences have in common, and text within a budget of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+CUT = " ..."
+"""What stands where text was cut off."""
+
+CountTokens = Callable[[str], int]
 
 
 def shared_prefix(a: Sequence[int], b: Sequence[int]) -> int:
@@ -19,3 +24,31 @@ def shared_prefix(a: Sequence[int], b: Sequence[int]) -> int:
         else:
             high = middle - 1
     return low
+
+
+def estimate_tokens(text: str) -> int:
+    """About how many tokens a text has: one for every four characters, and one.
+
+    >>> estimate_tokens("12345678")
+    3
+    """
+    return len(text) // 4 + 1
+
+
+def clip_text(text: str, budget: int, count_tokens: CountTokens = estimate_tokens) -> str:
+    """The text if it has at most `budget` tokens, else its beginning with a mark where it was cut; `""` if not even
+    the mark fits.
+
+    >>> clip_text("abcdefghij", 8, len)
+    'abcd ...'
+    """
+    if count_tokens(text) <= budget:
+        return text
+    low, high = 0, len(text)
+    while low < high:
+        middle = (low + high + 1) // 2
+        if count_tokens(text[:middle].rstrip() + CUT) <= budget:
+            low = middle
+        else:
+            high = middle - 1
+    return text[:low].rstrip() + CUT if low else ""

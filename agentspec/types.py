@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from agentspec.tokens import clip_text, estimate_tokens
+
 Credit = Literal["executed", "explored", "aux"]
 """What a sampled completion did: chose the executed action, was explored and not taken, or helped (memory, critics)."""
 
@@ -94,31 +96,62 @@ class AgentInput:
 
 @dataclass(frozen=True)
 class RecallItem:
-    """One thing remembered: text, relevance score, kind (episodic, summary, lesson, ...) and where it came from."""
+    """One thing remembered: text, relevance score, kind, where it came from, and how much it matters.
+
+    Args:
+        text: as it is shown.
+        score: relevance, on the method's own scale; for the record only.
+        kind: `episodic`, `summary`, `lesson`, ... Lessons are shown apart, within a budget of their own.
+        source: module or entry it came from.
+        priority: what to keep when not everything fits: the lowest goes first; of equals, what is listed last.
+    """
 
     text: str
     score: float = 0.0
     kind: str = "episodic"
     source: str = ""
+    priority: float = 0.0
 
 
 @dataclass(frozen=True)
 class Recall:
-    """m_t of the paper: what memory (or reflection) contributes to this step, most important item first."""
+    """m_t of the paper: what memory (or reflection) contributes to this step, in the order it is shown."""
 
     items: tuple[RecallItem, ...] = ()
 
+    @property
+    def lessons(self) -> Recall:
+        """The items of kind `lesson`."""
+        return Recall(tuple(i for i in self.items if i.kind == "lesson"))
+
+    @property
+    def memories(self) -> Recall:
+        """All other items."""
+        return Recall(tuple(i for i in self.items if i.kind != "lesson"))
+
     def render(self, budget: int, count_tokens: Callable[[str], int]) -> str:
-        """The items as lines, dropping from the end whole items that would pass ``budget`` tokens."""
-        lines: list[str] = []
-        used = 0
-        for item in self.items:
-            cost = count_tokens(item.text) + 1
-            if used + cost > budget:
+        """The items, each on lines of its own, within `budget` tokens.
+
+        What has the lowest priority is dropped first; the order shown stays; the last item that is not dropped is
+        clipped, not lost. A line break counts one token.
+        """
+        kept: dict[int, str] = {}
+        left = budget + 1  # no line break before the first
+        for i in sorted(range(len(self.items)), key=lambda i: (-self.items[i].priority, i)):
+            text = self.items[i].text
+            cost = count_tokens(text) + 1
+            if cost > left:
+                text = clip_text(text, left - 1, count_tokens)
+                if text and (not kept or left > MIN_CLIPPED):
+                    kept[i] = text
                 break
-            lines.append(item.text)
-            used += cost
-        return "\n".join(lines)
+            kept[i] = text
+            left -= cost
+        return "\n".join(kept[i] for i in sorted(kept))
+
+
+MIN_CLIPPED = 8
+"""Tokens below which a clipped item says nothing and is left out, unless it is the only one."""
 
 
 @dataclass(frozen=True)
@@ -283,3 +316,49 @@ class Transition:
     terminated: bool = False
     truncated: bool = False
     info: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experience:
+    """What a memory usually keeps of a step: the state it was taken in, the action, and what came of it.
+
+    Args:
+        step: number of the step, from 0.
+        state: the observation the action was chosen for.
+        action: the action as it was executed.
+        ok: whether the environment could carry it out.
+        feedback: what the environment said about it; the error if it was not possible.
+        reward: reward of the step.
+    """
+
+    step: int
+    state: str
+    action: str
+    ok: bool
+    feedback: str
+    reward: float
+
+    @classmethod
+    def of(cls, transition: Transition) -> Experience:
+        """The experience of a transition."""
+        info = transition.info
+        error = str(info.get("error") or "")
+        ok = not error and not info.get("invalid") and isinstance(transition.decision.action, Action)
+        feedback = error or str(info.get("message") or "done")
+        return cls(transition.step, transition.input.text, transition.action_text, ok, feedback, transition.reward)
+
+    def line(self) -> str:
+        """One line: number (from 1), action, what it did, and the reward if there was one."""
+        reward = f" ({self.reward:+.2f})" if self.reward else ""
+        return f"{self.step + 1}. {self.action} -> {self.feedback}{reward}"
+
+    def block(self, tokens: int, count_tokens: Callable[[str], int] = estimate_tokens) -> str:
+        """State, action, result and reward on labelled lines, within `tokens`: what is too long is the state.
+
+        Only if there is no room for the rest either is the rest clipped.
+        """
+        reward = f"\nReward: {self.reward:+.2f}" if self.reward else ""
+        rest = f"Action: {self.action}\nResult: {self.feedback}{reward}"
+        room = tokens - count_tokens(rest) - count_tokens("State: \n")
+        state = clip_text(" ".join(self.state.split()), room, count_tokens) if room > 0 else ""
+        return f"State: {state}\n{rest}" if state else clip_text(rest, tokens, count_tokens)

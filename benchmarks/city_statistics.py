@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.envs.deliverybench import City, generate, load_city
-from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier
+from agentspec.envs.deliverybench.city.generate import SPLITS
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.generate import SPLITS
-from agentspec.envs.deliverybench.orders import OrderBook
-from agentspec.envs.deliverybench.rules import FAIR, quirk_table
+from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
+from agentspec.envs.deliverybench.world.orders import OrderBook
+from agentspec.envs.deliverybench.world.rules import FAIR, quirk_table
 
 REFERENCE_MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "deliverybench" / "maps"
 SIZES = ("tiny", "small", "medium", "large")

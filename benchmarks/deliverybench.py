@@ -30,13 +30,13 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.envs.deliverybench import City, load_city, write_city
-from agentspec.envs.deliverybench.cache import CACHE_VARIABLE
-from agentspec.envs.deliverybench.citymap import forget_cities
-from agentspec.envs.deliverybench.courier import RuleBasedCourier
+from agentspec.envs.deliverybench.city.cache import CACHE_VARIABLE
+from agentspec.envs.deliverybench.city.citymap import forget_cities
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.observation import around, full_text
-from agentspec.envs.deliverybench.view import OfferCards, describe
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe
+from agentspec.envs.deliverybench.view.observation import around, full_text
+from agentspec.envs.deliverybench.world.engine import World
 
 REFERENCE_MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "deliverybench" / "maps"
 CITY = "medium-city-22"

@@ -32,8 +32,7 @@ STATIC, OBSERVATION, ANSWER, SUMMARY, SEGMENT = 300, 120, 8, 60, 8
 
 def make_rows(layout: str, rollouts: int, turns: int, vocabulary: int, seed: int = 0) -> list[Any]:
     """Rows of ``rollouts`` episodes in groups of four that start alike; the answers are trained."""
-    from trainers.batches import Row
-    from trainers.sequences import TokenSequence
+    from trainers.sequences import Row, TokenSequence
 
     rng = random.Random(seed)
 

@@ -45,11 +45,34 @@ REWARDS: dict[str, RewardEntry] = {
 }
 
 
+@dataclass(frozen=True)
+class Score:
+    """What an episode earned, computed once.
+
+    Args:
+        terms: each reward per step, unweighted.
+        steps: their weighted sum per step.
+    """
+
+    terms: Mapping[str, tuple[float, ...]]
+    steps: tuple[float, ...]
+
+    @property
+    def total(self) -> float:
+        """The weighted return of the episode."""
+        return math.fsum(self.steps)
+
+    @property
+    def sums(self) -> dict[str, float]:
+        """Episode sum of each reward, unweighted."""
+        return {name: math.fsum(values) for name, values in self.terms.items()}
+
+
 class RewardSet:
     """A weighted sum of rewards.
 
     Args:
-        weights: registered name -> weight. Default: ``earning_delta`` alone.
+        weights: registered name -> weight. Default: `earning_delta` alone.
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
@@ -59,36 +82,29 @@ class RewardSet:
                 raise SpecError(f"unknown reward {name!r}{suggest(name, REWARDS)}")
         self._functions = {name: REWARDS[name].load() for name in self.weights}
 
-    def terms(self, trajectory: Trajectory) -> dict[str, float] | None:
-        """Episode sum of each reward, unweighted; ``None`` if the episode is unscorable.
+    def score(self, trajectory: Trajectory) -> Score | None:
+        """What the episode earned, every tuple as long as the episode; `None` if it failed and cannot be scored.
 
         Raises:
             NonFiniteRewardError: a reward that is not finite.
+            ValueError: a reward that did not give one value per step.
         """
-        steps = self.steps(trajectory)
-        return None if steps is None else {name: math.fsum(values) for name, values in steps.items()}
-
-    def steps(self, trajectory: Trajectory) -> dict[str, tuple[float, ...]] | None:
-        """Each reward per step, unweighted, every tuple as long as the episode; ``None`` if unscorable."""
         if not trajectory.scorable:
             return None
-        result = {}
-        for name, function in self._functions.items():
-            values = function(trajectory)
-            if len(values) != len(trajectory.transitions):
-                raise ValueError(
-                    f"reward {name!r} gave {len(values)} values for {len(trajectory.transitions)} steps of episode "
-                    f"{trajectory.episode}; expected one per step"
-                )
-            if not all(map(math.isfinite, values)):
-                raise NonFiniteRewardError(
-                    f"reward {name!r} is not finite in episode {trajectory.episode}: {values}; the environment "
-                    "reported a number that is none"
-                )
-            result[name] = values
-        return result
+        terms = {name: self._values(name, trajectory) for name in self._functions}
+        columns = [[self.weights[name] * value for value in values] for name, values in terms.items()]
+        return Score(terms, tuple(math.fsum(column) for column in zip(*columns, strict=True)))
 
-    def total(self, trajectory: Trajectory) -> float | None:
-        """The weighted episode return; ``None`` if unscorable."""
-        terms = self.terms(trajectory)
-        return None if terms is None else math.fsum(self.weights[name] * value for name, value in terms.items())
+    def _values(self, name: str, trajectory: Trajectory) -> tuple[float, ...]:
+        values = tuple(self._functions[name](trajectory))
+        if len(values) != len(trajectory.transitions):
+            raise ValueError(
+                f"reward {name!r} gave {len(values)} values for {len(trajectory.transitions)} steps of episode "
+                f"{trajectory.episode}; expected one per step"
+            )
+        if not all(map(math.isfinite, values)):
+            raise NonFiniteRewardError(
+                f"reward {name!r} is not finite in episode {trajectory.episode}: {values}; the environment "
+                "reported a number that is none"
+            )
+        return values

@@ -172,5 +172,7 @@ def test_a_reflection_that_fails_touches_its_own_episode_only(fault: str) -> Non
     assert any(wrote) and not all(wrote)
     for trajectory, lesson in zip(played, wrote, strict=True):
         assert trajectory.scorable == (lesson or fault == "context")
-        assert bool(trajectory.error) != lesson
+        assert bool(trajectory.error) == (not lesson and fault == "model")
+        # A trial that is too long to be reflected on: nothing is learnt, and the metrics say so.
+        assert trajectory.metrics.get("reflection/problems/overflow", 0) == int(not lesson and fault == "context")
         assert trajectory.transitions

@@ -25,9 +25,10 @@ from typing import Any
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import LLMCall
-from trainers.batches import Row
+from trainers.credit import CreditRule, ScoredEpisode
+from trainers.estimators import estimator
 from trainers.runlog import RunLog
-from trainers.sequences import TokenSequence
+from trainers.sequences import Row, TokenSequence
 
 TOLERANCE = 1e-6
 
@@ -99,9 +100,9 @@ def audit(run: str | Path, step: int | None = None) -> Iterator[Receipt]:
             raise SpecError(
                 f"{folder} has no update {step}; it has {[r['round'] for r in RunLog(folder).read('updates.jsonl')]}"
             )
-    config = _config(manifest["config"])
+    rule = CreditRule.from_manifest(manifest["config"])
     for record in records:
-        yield _audit_update(folder, record, config)
+        yield _audit_update(folder, record, rule)
 
 
 def _manifest(path: Path) -> dict[str, Any]:
@@ -119,24 +120,7 @@ def _manifest(path: Path) -> dict[str, Any]:
     return data
 
 
-def _config(data: dict[str, Any]) -> Any:
-    """The run's configuration, as far as credit depends on it."""
-    from types import SimpleNamespace
-
-    from rewards import RewardSet
-    from trainers.sequences import TrainFilter
-
-    rewards = data.get("rewards")
-    weights = {rewards: 1.0} if isinstance(rewards, str) else rewards
-    train = TrainFilter(tuple(data["train_calls"]), tuple(data["train_credits"]), tuple(data["mask_truncated"]))
-    keys = ("estimator", "gamma", "gigpo_weight", "skip_zero_variance", "overlong", "overlong_ends", "num_generations")
-    known = {"normalize": data.get("normalize", "token"), **{k: data[k] for k in keys}}
-    return SimpleNamespace(train_filter=train, reward_set=RewardSet(weights), **known)
-
-
-def _audit_update(folder: Path, record: dict[str, Any], config: Any) -> Receipt:
-    from trainers.weighing import weigh
-
+def _audit_update(folder: Path, record: dict[str, Any], rule: CreditRule) -> Receipt:
     receipt = Receipt(record["round"], denominator=record["denominator"], blank_rows=record["blank_rows"])
     files = sorted((folder / "trajectories").glob(f"{record['round']:06d}*.jsonl"))
     if not files:
@@ -145,19 +129,20 @@ def _audit_update(folder: Path, record: dict[str, Any], config: Any) -> Receipt:
     episodes = [t for f in sorted(files, key=_rank) for t in read_trajectories(f)]
     receipt.episodes = len(episodes)
     receipt.unscorable = sum(not t.scorable for t in episodes)
-    _check_identity(episodes, record, config, receipt)
-    if len(episodes) % config.num_generations:
-        receipt.violations.append(f"{len(episodes)} episodes are no whole groups of {config.num_generations}")
+    scored = rule.score(episodes)
+    _check_identity(scored, record, receipt)
+    if len(episodes) % rule.group:
+        receipt.violations.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
         return receipt
-    weighed = weigh(episodes, config, config.reward_set, group=config.num_generations)
-    _check_rows(weighed.rows, episodes, record, receipt)
-    _check_advantages(weighed.rows, episodes, config, receipt)
-    for row in weighed.rows:
+    credited = rule.credit(scored)
+    _check_rows(credited.rows, episodes, record, receipt)
+    _check_advantages(credited.rows, episodes, rule, receipt)
+    for row in credited.rows:
         _check_tokens(row.sequence, episodes[row.episode], receipt)
-    receipt.rows = len(weighed.rows)
-    receipt.silent_rows = sum(r.silent for r in weighed.rows)
-    receipt.tokens = sum(len(r.sequence) for r in weighed.rows)
-    receipt.trained = sum(r.sequence.trained for r in weighed.rows)
+    receipt.rows = len(credited.rows)
+    receipt.silent_rows = sum(r.zero_gradient for r in credited.rows)
+    receipt.tokens = sum(len(r.sequence) for r in credited.rows)
+    receipt.trained = sum(r.sequence.trained for r in credited.rows)
     if receipt.trained != receipt.denominator:
         receipt.violations.append(f"denominator {receipt.denominator}, but {receipt.trained} tokens are trained")
     return receipt
@@ -167,15 +152,18 @@ def _rank(path: Path) -> int:
     return int(path.stem.partition(".rank")[2] or 0)
 
 
-def _check_identity(episodes: Sequence[Trajectory], record: dict[str, Any], config: Any, receipt: Receipt) -> None:
+def _check_identity(scored: Sequence[ScoredEpisode], record: dict[str, Any], receipt: Receipt) -> None:
     """The episodes are those of the receipt, with its returns, played by the policy of this update."""
+    episodes = [e.trajectory for e in scored]
     if [t.episode for t in episodes] != record["episodes"]:
         receipt.violations.append("the logged episodes are not those of the receipt")
     else:
-        for trajectory, logged in zip(episodes, record["returns"], strict=True):
-            value = config.reward_set.total(trajectory)
+        for episode, logged in zip(scored, record["returns"], strict=True):
+            value = episode.total
             if not _equal(value, logged):
-                receipt.violations.append(f"{trajectory.episode} returned {value}, but the receipt says {logged}")
+                receipt.violations.append(
+                    f"{episode.trajectory.episode} returned {value}, but the receipt says {logged}"
+                )
     expected = f"step-{record['round']}"
     strangers = [t.episode for t in episodes if t.policy != expected]
     if strangers:
@@ -213,18 +201,19 @@ def _equal(a: Any, b: Any) -> bool:
     )
 
 
-def _check_advantages(rows: Sequence[Row], episodes: Sequence[Trajectory], config: Any, receipt: Receipt) -> None:
+def _check_advantages(rows: Sequence[Row], episodes: Sequence[Trajectory], rule: CreditRule, receipt: Receipt) -> None:
     """Constant over a rollout, and zero in sum over a group (estimators per episode)."""
-    if config.estimator in ("reward_to_go", "gigpo"):
+    spec = estimator(rule.estimator)
+    if spec.per_step:
         return
     values: dict[int, float] = {}
     for row in rows:
         assert isinstance(row.advantage, float)
         if values.setdefault(row.episode, row.advantage) != row.advantage:
             receipt.violations.append(f"episode {row.episode} has rows with different advantages")
-    if config.normalize == "rollout":
+    if rule.normalize == "rollout" or not spec.zero_sum:
         return  # each rollout's value is scaled by its own length; the digests have compared the values already
-    size = config.num_generations
+    size = rule.group
     for start in range(0, len(episodes), size):
         members = [i for i in range(start, start + size) if episodes[i].scorable]
         if all(i in values for i in members):  # masked or silent members have no rows to sum over

@@ -8,7 +8,6 @@ with rows that train nothing. So no row is ever lost and the number of optimiser
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -18,28 +17,13 @@ from torch.utils.checkpoint import checkpoint
 
 from agentspec.tokens import shared_prefix
 from trainers.logprobs import sampled_logprobs
-from trainers.sequences import TokenSequence
+from trainers.sequences import Row, TokenSequence
 from trainers.tree import build_tree, packed_inputs, wanted_tokens
 
 Packing = Literal["tree", "padded"]
 
 ROWS = "rows"
 """Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One sequence with its advantage: a number, or one per token for step-level estimators."""
-
-    sequence: TokenSequence
-    advantage: float | tuple[float, ...]
-    episode: int
-
-    @property
-    def silent(self) -> bool:
-        """Whether the row has no policy gradient: nothing trained, or advantage zero throughout."""
-        values = (self.advantage,) if isinstance(self.advantage, (int, float)) else self.advantage
-        return self.sequence.trained == 0 or not any(values)
 
 
 def blank_row(token: int) -> Row:
@@ -101,7 +85,7 @@ def collate(
         n = len(row.sequence)
         ids[i, :n] = torch.tensor(row.sequence.tokens)
         attention[i, :n] = 1
-        if not (skip_silent and row.silent):
+        if not (skip_silent and row.zero_gradient):
             mask[i, :n] = torch.tensor(row.sequence.mask)
         logprobs[i, :n] = torch.tensor(row.sequence.logprobs)
         if per_token:
@@ -146,7 +130,7 @@ def rows_logprobs(
     length = max(len(r.sequence) for r in rows)
     logps = torch.zeros(len(rows), length - 1, device=device)
     entropies = torch.zeros(len(rows), length - 1, device=device)
-    todo = [i for i, r in enumerate(rows) if r.sequence.trained and not (skip_silent and r.silent)]
+    todo = [i for i, r in enumerate(rows) if r.sequence.trained and not (skip_silent and r.zero_gradient)]
     forward = _tree_forward if packing == "tree" else _padded_forward
     chunks = list(_chunks(rows, todo, packing, tokens_per_forward))
     recompute = packing == "tree" and len(chunks) > 1 and torch.is_grad_enabled()

@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from trainers.batches import Row
+from agentspec.trajectory import Trajectory
+from trainers.sequences import Row, TrainFilter
 
 
 @dataclass
@@ -96,3 +97,11 @@ def clipped_tokens(
     if loss_type == "cispo":
         return (ratios > high) & (advantages > 0)
     return ((ratios < 1 - low) & (advantages < 0)) | ((ratios > 1 + high) & (advantages > 0))
+
+
+def truncated_calls(episodes: Sequence[Trajectory], train: TrainFilter) -> dict[str, float]:
+    """Per kind of trained call: the share of completions that hit their length limit (a summary cut off, say)."""
+    cut: dict[str, list[bool]] = {}
+    for call in (c for t in episodes for c in t.calls if train.matches(c.tag.path)):
+        cut.setdefault(call.tag.path, []).extend(c.finish_reason == "length" for c in call.completions)
+    return {f"calls/{path}/truncated": sum(flags) / len(flags) for path, flags in cut.items() if flags}

@@ -19,7 +19,7 @@ from agentspec.llm.batching import Batching
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec, load_yaml
 from rewards import RewardSet
-from trainers.advantages import ESTIMATORS
+from trainers.estimators import ESTIMATORS
 from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.vllm import check_vllm
 
@@ -33,7 +33,6 @@ ROW_LOSSES = {
 }
 """Loss types that depend on how episodes split into rows, and how."""
 
-STEP_ESTIMATORS = ("reward_to_go", "gigpo")
 ENDS = ("context", "budget", "max_steps", "truncated")
 
 REFUSED_LOSSES = {
@@ -59,8 +58,7 @@ class ScaffoldConfig(GRPOConfig):
         train_calls: patterns over ``module/purpose`` of the calls that are trained.
         train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
         rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
-        estimator: how returns become advantages: per episode ``grpo``, ``centred``, ``rloo``; per step
-            ``reward_to_go``, ``gigpo``.
+        estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
         skip_zero_variance: leave groups whose returns are all equal out of the loss denominator too.
@@ -110,7 +108,7 @@ class ScaffoldConfig(GRPOConfig):
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
     rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
-    estimator: str = field(default="grpo", metadata={"help": "grpo, centred, rloo, reward_to_go or gigpo"})
+    estimator: str = field(default="grpo", metadata={"help": ", ".join(ESTIMATORS)})
     gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
     gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
     skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
@@ -227,9 +225,8 @@ class ScaffoldConfig(GRPOConfig):
 
     def _check_names(self) -> None:
         """Every name among its alternatives."""
-        estimators = (*ESTIMATORS, *STEP_ESTIMATORS)
         for name, known in (
-            ("estimator", estimators),
+            ("estimator", tuple(ESTIMATORS)),
             ("normalize", ("token", "rollout")),
             ("overlong", ("mask", "keep", "drop")),
             ("memory_carry", ("first", "best")),

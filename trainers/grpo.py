@@ -27,8 +27,9 @@ from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.audit import receipt_rows
 from trainers.batches import ROWS, Row, blank_row, collate, deal, rows_logprobs
-from trainers.call_metrics import CallMetrics, clipped_tokens
+from trainers.call_metrics import CallMetrics, clipped_tokens, truncated_calls
 from trainers.config import ScaffoldConfig
+from trainers.credit import CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
 from trainers.rollouts import collect, rollout_jobs, starting_states, task_of
@@ -36,7 +37,6 @@ from trainers.runlog import RunLog, transcript
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
 from trainers.vllm import importance_ratio, vllm_round
-from trainers.weighing import weigh
 
 
 class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
@@ -62,7 +62,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
     ) -> None:
         args.check()
         self.rewards_used = args.reward_set
-        self._episodes: list[Trajectory] = []
+        self.credit_rule = CreditRule.from_config(args)
+        self._played: list[ScoredEpisode] = []
         self._current: dict[str, Any] | None = None
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
@@ -107,7 +108,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
     @property
     def last_episodes(self) -> list[Trajectory]:
         """This rank's episodes of the last generation round."""
-        return self._episodes
+        return [e.trajectory for e in self._played]
 
     # --- rollouts ----------------------------------------------------------------------------------------------------
 
@@ -126,8 +127,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         """A TRL reward function that reads the finished episodes."""
 
         def reward(**_: Any) -> list[float | None]:
-            terms = [self.rewards_used.terms(t) for t in self._episodes]
-            return [None if t is None else t[name] for t in terms]
+            return [None if e.score is None else e.score.sums[name] for e in self._played]
 
         reward.__name__ = name
         return reward
@@ -148,12 +148,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             memory=self._memory,
         )
         with self._current_weights():
-            self._episodes = self._play(jobs)
+            self._played = self._play(jobs)
         self._log_episodes()
         self._memory = self._carried_memory()
         stand_in = [self._tokenizer.pad_token_id]
-        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self._episodes]
-        n = len(self._episodes)
+        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self.last_episodes]
+        n = len(completions)
         return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
 
     def _runner(self, spec: AgentSpec) -> Runner:
@@ -167,10 +167,10 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             policy=f"step-{self.state.global_step}",
         )
 
-    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
+    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
         """One episode per job, in order, those that failed among them; ``spec``: another than the training scaffold."""
         runner = self._runner(spec or self.args.spec)
-        return collect(runner, jobs, retries=self.args.retries, rewards=self.rewards_used)
+        return collect(runner, jobs, self.rewards_used, retries=self.args.retries)
 
     @contextmanager
     def _current_weights(self) -> Iterator[None]:
@@ -197,22 +197,16 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
 
     def _rows(self) -> list[Row]:
         """All sequences of this rank's episodes with the advantages of the whole group."""
-        weighed = weigh(
-            self._episodes,
-            self.args,
-            self.rewards_used,
-            group=self.num_generations,
-            rank=self.accelerator.process_index,
-            gather=gather_object,
-        )
-        for name, value in weighed.metrics.items():
+        credited = self.credit_rule.credit(self._played, rank=self.accelerator.process_index, gather=gather_object)
+        cut = truncated_calls(self.last_episodes, self.credit_rule.train)
+        for name, value in (credited.metrics | cut).items():
             self._metrics["train"][name].append(value)
         self._check_trained()
-        return weighed.rows
+        return credited.rows
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""
-        check_trained(self._episodes, self.args, gather_object)
+        check_trained(self.last_episodes, self.args, gather_object)
 
     def _carried_memory(self) -> bytes | None:
         """With ``scope: run``: the bank of memories that the next round starts from, the same on every rank.
@@ -222,7 +216,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         if self.args.spec.scope != "run":
             return None
         bank = MemoryBank.of_spec(self.args.spec) if self._memory is None else MemoryBank.load(self._memory)
-        played = [(t.task.key, self.rewards_used.total(t), t.memory_state) for t in self._episodes]
+        played = [(e.trajectory.task.key, e.total, e.trajectory.memory_state) for e in self._played]
         bank = bank.carried(gather_object(played), self.args.memory_carry)
         if self.accelerator.is_main_process:
             save_bank(self.run_log.folder / MEMORY_FILE, bank)
@@ -328,18 +322,18 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
 
     def _log_episodes(self) -> None:
         """Scaffold metrics of this rank's episodes, and the trajectories themselves."""
-        scored = [figures(t) for t in self._episodes if t.scorable]
+        scored = [figures(t) for t in self.last_episodes if t.scorable]
         for name in dict.fromkeys(name for row in scored for name in row):
             values = [row[name] for row in scored if name in row]
             self._metrics["train"][f"episode/{name}"].append(sum(values) / len(values))
-        self.run_log.trajectories(self._round, self.accelerator.process_index, self._episodes)
+        self.run_log.trajectories(self._round, self.accelerator.process_index, self.last_episodes)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
-        first = self.accelerator.process_index * len(self._episodes)
+        first = self.accelerator.process_index * len(self._played)
         receipts = [{**r, "episode": first + r["episode"]} for r in receipt_rows(rows)]
         blank = sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])
-        played = gather_object([(t.episode, self.rewards_used.total(t)) for t in self._episodes])
+        played = gather_object([(e.trajectory.episode, e.total) for e in self._played])
         receipt = {
             "round": self._round,
             "episodes": [name for name, _ in played],
@@ -387,7 +381,6 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
                 validation_scaffolds(self.args),
                 [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
                 lambda spec, jobs: self._play(jobs, spec),
-                self.rewards_used,
                 rank=self.accelerator.process_index,
                 ranks=self.accelerator.num_processes,
                 gather=gather_object,

@@ -24,8 +24,8 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.registry import SpecError
 from agentspec.state import write_atomic
-from trainers.batches import ROWS, Row
-from trainers.sequences import TokenSequence
+from trainers.batches import ROWS
+from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:
     from trl import GRPOTrainer as Base

@@ -32,6 +32,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.trajectory import Trajectory, write_trajectories
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
 from trainers.rollouts import collect
@@ -120,17 +121,17 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
     ) -> None:
         check_retroformer(args)
         super().__init__(model, args, make_llm=make_llm or partial(routed_llm, batching=args.batching), **kwargs)
-        self._first_trials: list[Trajectory] = []
+        self._first_trials: list[ScoredEpisode] = []
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: Any = None) -> None:
         """As transformers does; its older versions leave out an adapter that lies beside the folder of another."""
         super()._load_from_checkpoint(resume_from_checkpoint, model)
         (model or self.model).load_adapter(resume_from_checkpoint, TRAINED, is_trainable=True)
 
-    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[Trajectory]:
+    def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
         runner = self._runner(spec or acting_scaffold(self.args))
         self._first_trials, episodes = play_trials(
-            lambda trials: collect(runner, trials, retries=self.args.retries, rewards=self.rewards_used), jobs
+            lambda trials: collect(runner, trials, self.rewards_used, retries=self.args.retries), jobs
         )
         return episodes
 
@@ -140,14 +141,15 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
 
     def _check_trained(self) -> None:
         """As for any run, unless no first trial of any rank failed: then there is nothing to learn from this round."""
-        if any(gather_object([any(map(has_lesson, self._episodes))])):
+        if any(gather_object([any(map(has_lesson, self.last_episodes))])):
             super()._check_trained()
 
     def _log_episodes(self) -> None:
         """As for any run; also what the lessons were worth, and the trials they are about."""
         super()._log_episodes()
-        scored = [t for t in self._first_trials if t.scorable]
-        gains = [float(t.metrics["reflection/reward"]) for t in self._episodes if t.scorable and has_lesson(t)]
+        firsts = [e.trajectory for e in self._first_trials]
+        scored = [t for t in firsts if t.scorable]
+        gains = [float(t.metrics["reflection/reward"]) for t in self.last_episodes if t.scorable and has_lesson(t)]
         for name, values in (
             ("failed_first_trials", [float(is_due(t)) for t in scored]),
             ("first_return", [float(t.metrics["return"]) for t in scored]),
@@ -156,12 +158,12 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
             if values:
                 self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
         name = f"{self._round:06d}.rank{self.accelerator.process_index}.jsonl"
-        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, self._first_trials)
+        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, firsts)
 
 
 def play_trials(
-    play: Callable[[Sequence[Job]], list[Trajectory]], jobs: Sequence[Job]
-) -> tuple[list[Trajectory], list[Trajectory]]:
+    play: Callable[[Sequence[Job]], list[ScoredEpisode]], jobs: Sequence[Job]
+) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
     """The first trial of each group of jobs, and for every job the trial that follows it.
 
     Args:
@@ -176,11 +178,14 @@ def play_trials(
     firsts = play(heads)
     groups = [i for i, j in enumerate(jobs) if j.rollout == 0]
     before = [firsts[sum(start <= i for start in groups) - 1] for i in range(len(jobs))]
-    due = [i for i, first in enumerate(before) if is_due(first)]
-    episodes = [replace(first, rollout=job.rollout) for first, job in zip(before, jobs, strict=True)]
-    followed = play([replace(jobs[i], memory_state=before[i].memory_state) for i in due])
-    for i, trajectory in zip(due, followed, strict=True):
-        episodes[i] = trajectory
+    due = [i for i, first in enumerate(before) if is_due(first.trajectory)]
+    episodes = [
+        replace(first, trajectory=replace(first.trajectory, rollout=job.rollout))
+        for first, job in zip(before, jobs, strict=True)
+    ]
+    followed = play([replace(jobs[i], memory_state=before[i].trajectory.memory_state) for i in due])
+    for i, episode in zip(due, followed, strict=True):
+        episodes[i] = episode
     return firsts, episodes
 
 

@@ -1,7 +1,8 @@
 """G rollouts of each task, run through the agent, all at once.
 
 The trainer hands over its generation batch (task rows, each repeated G times by TRL's sampler); what comes back is one
-:class:`~agentspec.trajectory.Trajectory` per row, in order. A rollout that failed is among them, marked unscorable.
+:class:`~trainers.credit.ScoredEpisode` per row, in order: the trajectory and what it earned, computed once. A rollout
+that failed is among them, without a score.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from agentspec.llm.recorder import derive_seed
 from agentspec.tasks import TEST_SEEDS, make_tasks
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from rewards import RewardSet
+from rewards import RewardSet, Score
+from trainers.credit import ScoredEpisode
 
 __all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "starting_states", "task_of", "task_rows"]
 
@@ -78,17 +80,15 @@ def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool
     return [(bank.as_start() if unseen else bank).of(task) for task in tasks]
 
 
-def collect(
-    runner: Runner, jobs: Sequence[Job], *, retries: int = 0, rewards: RewardSet | None = None
-) -> list[Trajectory]:
-    """Run the jobs; every failure is a trajectory too.
+def collect(runner: Runner, jobs: Sequence[Job], rewards: RewardSet, *, retries: int = 0) -> list[ScoredEpisode]:
+    """Run the jobs and score what they gave; every failure is an episode too.
 
-    A failed job is run again up to ``retries`` times, each time with a seed of its own; what still fails stays failed.
-    With ``rewards``, an episode is a failure too if its environment reported NaN or infinity and cannot be scored.
+    A failed job is run again up to `retries` times, each time with a seed of its own; what still fails stays failed.
+    An episode is a failure too if its environment reported NaN or infinity and cannot be scored.
     """
     episodes = [_scored(t, rewards) for t in runner.run(jobs)]
     for attempt in range(1, retries + 1):
-        failed = [i for i, t in enumerate(episodes) if not t.scorable]
+        failed = [i for i, e in enumerate(episodes) if e.score is None]
         if not failed:
             break
         again = [replace(jobs[i], run_seed=derive_seed(jobs[i].run_seed, "retry", attempt)) for i in failed]
@@ -97,19 +97,18 @@ def collect(
     return episodes
 
 
-def _scored(trajectory: Trajectory, rewards: RewardSet | None) -> Trajectory:
-    """The episode, failed if what its environment reported makes its reward no number.
+def _scored(trajectory: Trajectory, rewards: RewardSet) -> ScoredEpisode:
+    """The episode and what it earned; failed if what its environment reported makes its reward no number.
 
     Raises:
         ValueError: a reward that this environment cannot be scored with: every episode would fail.
     """
-    if rewards is None:
-        return trajectory
+    score: Score | None = None
     try:
-        rewards.terms(trajectory)
+        score = rewards.score(trajectory)
     except ValueError as error:
         reported = (value for t in trajectory.transitions for value in t.info.values())
         if all(math.isfinite(v) for v in reported if isinstance(v, float)):
             raise
-        return replace(trajectory, status="failed", error=f"not finite: {error}")
-    return trajectory
+        trajectory = replace(trajectory, status="failed", error=f"not finite: {error}")
+    return ScoredEpisode(trajectory, score)

@@ -117,15 +117,39 @@ class TokenSequence:
                 self.allowed[position] = choice
 
 
+Advantage = float | tuple[float, ...]
+"""A number, or one per token of a row."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One sequence with its advantage: a number, or one per token for estimators per step."""
+
+    sequence: TokenSequence
+    advantage: Advantage
+    episode: int
+
+    @property
+    def zero_gradient(self) -> bool:
+        """Whether the row has no policy gradient: nothing trained, or advantage zero throughout."""
+        values = (self.advantage,) if isinstance(self.advantage, (int, float)) else self.advantage
+        return self.sequence.trained == 0 or not any(values)
+
+
 def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) -> list[TokenSequence]:
     """The training rows of one episode, each with at least one trained token.
 
     A call extends the longest sequence that its prompt contains as a prefix. Two completions of one prompt never share
-    a row: the second starts its own.
+    a row: the second starts its own. A call made after the last step (`tag.step` is the number of transitions, a
+    memory that stores the last one, say) earns nothing in this episode and is left out; calls of
+    helper models (the spec's `roles`) are never trained.
     """
     train = train or TrainFilter()
     rows: list[TokenSequence] = []
     for call in trajectory.calls:
+        helper = any(fnmatchcase(call.tag.module, role) for role in trajectory.spec.get("roles", {}))
+        if helper or call.tag.step >= len(trajectory.transitions):
+            continue
         for index in train.completions(call):
             row = _extendable(rows, call.prompt_ids)
             if row is None:

@@ -1,7 +1,7 @@
 """SUPO (arXiv 2510.06727) as a configuration: GRPO with a summary schedule, trained summaries and overlong masking.
 
 There is no second trainer. Summaries come from :mod:`agentspec.memory.summary`; each segment between two of them is a
-row (:mod:`trainers.sequences`), the advantage belongs to the rollout (:mod:`trainers.weighing`), and an episode that
+row (:mod:`trainers.sequences`), the advantage belongs to the rollout (:mod:`trainers.credit`), and an episode that
 ran out of context gets zero loss while it stays in the baseline (``overlong: mask``). This module checks that a
 configuration is SUPO and fills in what follows from it.
 """

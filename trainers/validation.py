@@ -14,9 +14,8 @@ from typing import Any
 from agentspec.episode import Job
 from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
-from agentspec.trajectory import Trajectory
-from rewards import RewardSet
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
@@ -30,8 +29,7 @@ def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
 def validate(
     scaffolds: Mapping[str, AgentSpec],
     jobs: Sequence[Job],
-    play: Callable[[AgentSpec, Sequence[Job]], Sequence[Trajectory]],
-    rewards: RewardSet,
+    play: Callable[[AgentSpec, Sequence[Job]], Sequence[ScoredEpisode]],
     *,
     rank: int = 0,
     ranks: int = 1,
@@ -42,8 +40,7 @@ def validate(
     Args:
         scaffolds: by prefix, as of :func:`validation_scaffolds`.
         jobs: all of them; rank r plays those at r, r + ranks, ...
-        play: scaffold, jobs -> episodes.
-        rewards: what ``reward`` is, as in training.
+        play: scaffold, jobs -> episodes, scored by the training reward.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
@@ -53,7 +50,7 @@ def validate(
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
-        rows = gather([_figures(t, rewards) for t in play(spec, jobs[rank::ranks])])
+        rows = gather([_figures(episode) for episode in play(spec, jobs[rank::ranks])])
         scored = [row for row in rows if row is not None]
         metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
         for name in dict.fromkeys(name for row in scored for name in row if name != "reward"):
@@ -62,12 +59,11 @@ def validate(
     return metrics
 
 
-def _figures(trajectory: Trajectory, rewards: RewardSet) -> dict[str, float] | None:
-    """Numbers of one episode; ``None`` if it cannot be scored."""
-    total = rewards.total(trajectory)
-    if total is None:
+def _figures(episode: ScoredEpisode) -> dict[str, float] | None:
+    """Numbers of one episode; `None` if it failed."""
+    if episode.score is None:
         return None
-    return figures(trajectory) | {"reward": total}
+    return figures(episode.trajectory) | {"reward": episode.score.total}
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -8,8 +8,10 @@ Modules never hold a backend, only a :class:`ModuleLLM`: the recorder bound to t
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 from agentspec.llm.base import LLM, LLMError, Message, Request
@@ -59,6 +61,13 @@ class Recorder:
         sampling: defaults of every call; modules override what their method fixes.
         budget: upper bounds for the episode.
         prices: dollars per token, by model name.
+        helpers: pattern over module names (`memory.*`) -> the backend that answers these modules in place of `llm`.
+
+    Attributes:
+        step: stamped on every call. What is asked after step t, by `store`, belongs to step t + 1: it can earn only
+            what comes after.
+        problems: (module, what) -> how often something that is not an error went wrong.
+        backend_error: what a backend raised that is no `LLMError`: a defect of the backend, not of a module.
     """
 
     def __init__(
@@ -70,8 +79,12 @@ class Recorder:
         sampling: Sampling | None = None,
         budget: Budget | None = None,
         prices: Prices | None = None,
+        helpers: Mapping[str, LLM] | None = None,
     ) -> None:
         self.llm = llm
+        self.helpers = dict(helpers or {})
+        self.problems: Counter[tuple[str, str]] = Counter()
+        self.backend_error: Exception | None = None
         self.episode = episode
         self.seed = seed
         self.sampling = sampling or Sampling()
@@ -102,15 +115,28 @@ class Recorder:
             seed=derive_seed(self.seed, call_id),
             id=call_id,
         )
-        call = await self.llm.generate(request)
-        usage = replace(call.usage, cost=self.prices.cost(call.model or self.llm.name, call.usage))
+        llm = self.backend(module)
+        try:
+            call = await llm.generate(request)
+        except LLMError:
+            raise
+        except Exception as error:
+            self.backend_error = error
+            raise
+        usage = replace(call.usage, cost=self.prices.cost(call.model or llm.name, call.usage))
         call = replace(call, usage=usage)
         self._tokens += usage.input_tokens + usage.output_tokens
         self._cost += usage.cost
         self.calls.append(call)
         return call
 
-    async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
+    def backend(self, module: str) -> LLM:
+        """Who answers the calls of `module`."""
+        return next((llm for pattern, llm in self.helpers.items() if fnmatchcase(module, pattern)), self.llm)
+
+    async def score(
+        self, messages: Sequence[Message], continuations: Sequence[str], module: str = ""
+    ) -> tuple[float, ...]:
         """Log-probabilities of continuations; metered as input tokens and bounded by the token and cost budgets.
 
         A scoring samples nothing, so it is no call of its own: ``scorings`` counts them, ``scored`` their usage.
@@ -119,10 +145,17 @@ class Recorder:
             BudgetExceededError: before the scoring, if the budget of tokens or dollars is used up.
         """
         replace(self.budget, calls=None).check(0, self._tokens, self._cost)
-        scores = await self.llm.score(messages, continuations, episode=self.episode)
+        llm = self.backend(module)
+        try:
+            scores = await llm.score(messages, continuations, episode=self.episode)
+        except LLMError:
+            raise
+        except Exception as error:
+            self.backend_error = error
+            raise
         texts = [m.text for m in messages] + list(continuations)
-        read = Usage(input_tokens=sum(map(self.llm.count_tokens, texts)))
-        cost = self.prices.cost(self.llm.name, read)
+        read = Usage(input_tokens=sum(map(llm.count_tokens, texts)))
+        cost = self.prices.cost(llm.name, read)
         self.scorings += 1
         self.scored = Usage(self.scored.input_tokens + read.input_tokens, cost=self.scored.cost + cost)
         self._tokens += read.input_tokens
@@ -169,10 +202,23 @@ class ModuleLLM:
         """Credit a completion that took effect outside a decision (a summary that became the context, say)."""
         self.recorder.credit(call.id, completion, "executed")
 
+    def credit(self, call: LLMCall, completion: int, credit: Credit) -> None:
+        """Say what a completion was for."""
+        self.recorder.credit(call.id, completion, credit)
+
+    def count(self, problem: str) -> None:
+        """Count something that went wrong in this module."""
+        self.recorder.problems[self.module, problem] += 1
+
+    @property
+    def window(self) -> int:
+        """Tokens that the context of the module's model holds (0: unknown)."""
+        return self.recorder.backend(self.module).max_context
+
     async def score(self, messages: Sequence[Message], continuations: Sequence[str]) -> tuple[float, ...]:
         """Log-probabilities of ``continuations`` after the prompt (see :meth:`Recorder.score`)."""
-        return await self.recorder.score(messages, continuations)
+        return await self.recorder.score(messages, continuations, self.module)
 
     def count_tokens(self, text: str) -> int:
         """Tokens of ``text`` for budgets of prompt sections."""
-        return self.recorder.llm.count_tokens(text)
+        return self.recorder.backend(self.module).count_tokens(text)

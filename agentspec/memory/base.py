@@ -7,15 +7,12 @@ from collections import deque
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
-from agentspec.types import AgentInput, Recall, RecallItem, Task, Transition
+from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
 
 def describe(transition: Transition) -> str:
-    """One line about a step: number, action, what it did, and the money it changed."""
-    info = transition.info
-    outcome = str(info.get("error") or info.get("message") or "done")
-    money = f" ({transition.reward:+.2f})" if transition.reward else ""
-    return f"{transition.step + 1}. {transition.action_text} -> {outcome}{money}"
+    """One line about a step: number, action, what it did, and its reward."""
+    return Experience.of(transition).line()
 
 
 class BaseMemory:
@@ -36,7 +33,7 @@ class BaseMemory:
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         lines = list(self._lines)[-k:] if k else list(self._lines)
-        return Recall(tuple(RecallItem(line, kind="episodic", source="memory.base") for line in lines))
+        return Recall(tuple(RecallItem(line, source="memory.base", priority=i) for i, line in enumerate(lines)))
 
     async def store(self, transition: Transition) -> None:
         self._lines.append(describe(transition))

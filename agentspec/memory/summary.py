@@ -11,6 +11,8 @@ the state it led to. The same module serves evaluation, so a policy meets the co
 
 from __future__ import annotations
 
+import math
+
 from agentspec.llm.base import Message, user
 from agentspec.memory.base import describe
 from agentspec.protocols import Services
@@ -66,19 +68,19 @@ class SummaryMemory:
         if self.services.context.layout == "conversation":
             return Recall()
         carried = [CARRY.format(summary=self._summary)] if self._summary else []
-        items = [RecallItem(text, kind="summary", source="memory.summary") for text in carried]
-        return Recall((*items, *(RecallItem(line, source="memory.summary") for line in self._lines)))
+        items = [RecallItem(text, kind="summary", source="memory.summary", priority=math.inf) for text in carried]
+        since = [RecallItem(line, source="memory.summary", priority=i) for i, line in enumerate(self._lines)]
+        return Recall((*items, *since))
 
     async def store(self, transition: Transition) -> None:
         self._actions += 1
         self._lines.append(describe(transition))
         if transition.terminated or transition.truncated or not self._due():
             return
-        call = await self.services.llm.generate(
-            "summary", self._prompt(transition), max_tokens=self.summary_tokens, stop=(), choices=()
-        )
-        self.services.llm.executed(call)
-        self._summary = call.text.strip()
+        answer = await self.services.ask("summary", self._prompt(transition), self.summary_tokens, credit="executed")
+        if answer.value is None:  # nothing was written: the conversation stays, and the next step asks again
+            return
+        self._summary = answer.value
         self._summaries += 1
         self._actions = 0
         self._lines = []
@@ -94,7 +96,7 @@ class SummaryMemory:
 
     def _context_tokens(self) -> int:
         """Tokens of the newest acting call, prompt and answer."""
-        calls = [c for c in self.services.llm.recorder.calls if c.tag.module != "memory.summary"]
+        calls = [c for c in self.services.llm.recorder.calls if c.tag.purpose != "summary"]
         return len(calls[-1].prompt_ids) + len(calls[-1].completions[0].token_ids) if calls else 0
 
     def _prompt(self, transition: Transition) -> tuple[Message, ...]:

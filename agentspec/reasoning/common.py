@@ -42,10 +42,9 @@ def render_actions(schema: ActionSchema) -> str:
     return "\n".join(lines)
 
 
-def user_turn(input: AgentInput, recall: Recall, services: Services, memory_tokens: int) -> str:
-    """What memory recalls (within its budget of tokens), then the observation."""
-    remembered = recall.render(memory_tokens, services.llm.count_tokens) if recall.items else ""
-    return f"Memory (recent steps and lessons):\n{remembered}\n\n{input.text}" if remembered else input.text
+def user_turn(input: AgentInput, recall: Recall, services: Services) -> str:
+    """What memory recalls (within the spec's budgets of tokens), then the observation."""
+    return services.context.recalled(recall) + input.text
 
 
 def default_answer(schema: ActionSchema) -> str:

@@ -32,7 +32,6 @@ class ChainOfThought(Stateless):
     """A chain of thought per decision.
 
     Args:
-        memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
         enable_history: keep the chains in the conversation.
     """
@@ -40,19 +39,17 @@ class ChainOfThought(Stateless):
     def __init__(
         self,
         services: Services,
-        memory_tokens: int = 512,
         thought_tokens: int | None = None,
         enable_history: bool = False,
     ) -> None:
         self.services = services
         self.history = enable_history
-        self.memory_tokens = memory_tokens
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         if input.action_schema.choices:
             return await self._think_then_choose(input, recall)
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         messages = self.services.context.prompt(static_prompt(input, THINK_THEN_CALL), dynamic)
         call = await self.services.llm.generate("act", messages, **self.limit)
         answer = last_action_line(call.text)
@@ -62,7 +59,7 @@ class ChainOfThought(Stateless):
         return Decision(action, rationale=call.text, calls=((call.id, 0),), valid=valid, turn=(turn,))
 
     async def _think_then_choose(self, input: AgentInput, recall: Recall) -> Decision:
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         messages = self.services.context.prompt(static_prompt(input, THINK), dynamic)
         thought = await self.services.llm.generate("think", messages, **self.limit)
         if self.history:

@@ -8,19 +8,14 @@ from agentspec.types import Action, AgentInput, Decision, Recall
 
 
 class Direct(Stateless):
-    """Answers with the action only.
+    """Answers with the action only."""
 
-    Args:
-        memory_tokens: budget of what memory adds to the prompt.
-    """
-
-    def __init__(self, services: Services, memory_tokens: int = 512) -> None:
+    def __init__(self, services: Services) -> None:
         self.services = services
-        self.memory_tokens = memory_tokens
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         static = static_prompt(input, default_answer(input.action_schema))
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         messages = self.services.context.prompt(static, dynamic)
         action, call = await ask_action(self.services, messages, input.action_schema)
         return Decision(action, calls=((call.id, 0),), valid=isinstance(action, Action), turn=(sampled(call),))

@@ -95,7 +95,7 @@ class LanguageAgentTreeSearch:
         temperature: of proposals.
         max_calls: most requests per decision (``None``: no limit).
         max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
-        memory_tokens, path_tokens, lesson_tokens: budgets of prompt sections.
+        path_tokens, lesson_tokens: budgets of prompt sections.
         prediction_tokens: most tokens of a predicted observation, of a rating in words, and of a reflection.
         thought_tokens: most tokens of a proposal (``None``: the spec's ``max_tokens``).
     """
@@ -119,7 +119,6 @@ class LanguageAgentTreeSearch:
         temperature: float = 1.0,
         max_calls: int | None = None,
         max_search_tokens: int | None = None,
-        memory_tokens: int = 512,
         path_tokens: int = 512,
         lesson_tokens: int = 192,
         prediction_tokens: int | None = None,
@@ -149,7 +148,7 @@ class LanguageAgentTreeSearch:
         self.world = world
         self.temperature = temperature
         self.limits = {"calls": max_calls, "tokens": max_search_tokens}
-        self.memory_tokens, self.path_tokens, self.lesson_tokens = memory_tokens, path_tokens, lesson_tokens
+        self.path_tokens, self.lesson_tokens = path_tokens, lesson_tokens
         self.prediction_tokens: int = chosen["prediction_tokens"]
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self._lessons: list[str] = []
@@ -168,7 +167,7 @@ class LanguageAgentTreeSearch:
         self._lessons = []
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
         meter = Meter(self.services.llm, **self.limits)
         simulator = self.services.simulator if self.world == "environment" else None

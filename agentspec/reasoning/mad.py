@@ -70,7 +70,6 @@ class MultiAgentDebate(Stateless):
         num_rounds: rounds of debate after the independent one.
         argue: menu mode: argue in words before every choice.
         quote_tokens: most tokens quoted of one other answer.
-        memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of an answer in words (``None``: the spec's ``max_tokens``).
     """
 
@@ -82,7 +81,6 @@ class MultiAgentDebate(Stateless):
         num_rounds: int | None = None,
         argue: bool | None = None,
         quote_tokens: int = 256,
-        memory_tokens: int = 512,
         thought_tokens: int | None = None,
     ) -> None:
         given = {"num_agents": num_agents, "num_rounds": num_rounds, "argue": argue}
@@ -94,12 +92,11 @@ class MultiAgentDebate(Stateless):
         self.rounds: int = chosen["num_rounds"]
         self.argue: bool = chosen["argue"]
         self.quote_tokens = quote_tokens
-        self.memory_tokens = memory_tokens
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         schema = input.action_schema
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         how = (ARGUE if self.argue else MENU_ANSWER) if schema.choices else ANSWER
         base = self.services.context.prompt(static_prompt(input, how), dynamic)
         advisers = [Adviser(base) for _ in range(self.agents)]

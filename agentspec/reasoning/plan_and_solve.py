@@ -69,7 +69,6 @@ class PlanAndSolve:
         max_goals: sub-goals asked for.
         plan_tokens: most tokens of a plan.
         feedback_tokens: budget of the failures that the planner is shown.
-        memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of a step's words (``None``: the spec's ``max_tokens``).
     """
 
@@ -85,7 +84,6 @@ class PlanAndSolve:
         max_goals: int = 5,
         plan_tokens: int | None = None,
         feedback_tokens: int = 128,
-        memory_tokens: int = 512,
         thought_tokens: int | None = None,
     ) -> None:
         chosen = settings("plan_and_solve", PRESETS, preset, {"think": think, "plan_tokens": plan_tokens})
@@ -100,7 +98,6 @@ class PlanAndSolve:
         self.max_goals = max_goals
         self.plan_tokens: int = chosen["plan_tokens"]
         self.feedback_tokens = feedback_tokens
-        self.memory_tokens = memory_tokens
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self._reset()
 
@@ -118,7 +115,7 @@ class PlanAndSolve:
         if self.one_call and not input.action_schema.choices:
             return await self._plan_and_solve_at_once(input, recall)
         static = static_prompt(input, ON_REQUEST)
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         why = self._reason_to_plan()
         made: LLMCall | None = None
         if why is not None:
@@ -210,7 +207,7 @@ class PlanAndSolve:
         )
 
     async def _plan_and_solve_at_once(self, input: AgentInput, recall: Recall) -> Decision:
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         messages = self.services.context.prompt(static_prompt(input, ONE_CALL), dynamic)
         call = await self.services.llm.generate("act", messages, **self.limit)
         action = read_action(call.text, input.action_schema)

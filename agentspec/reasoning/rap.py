@@ -135,7 +135,7 @@ class ReasoningViaPlanning(Stateless):
         temperature: of proposals and predictions.
         max_calls: most requests and scorings per decision (``None``: no limit).
         max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
-        memory_tokens, path_tokens: budgets of prompt sections.
+        path_tokens: budgets of prompt sections.
         prediction_tokens: most tokens of a predicted observation.
         thought_tokens: most tokens of a proposed action (``None``: the spec's ``max_tokens``).
     """
@@ -156,7 +156,6 @@ class ReasoningViaPlanning(Stateless):
         temperature: float = 0.8,
         max_calls: int | None = None,
         max_search_tokens: int | None = None,
-        memory_tokens: int = 512,
         path_tokens: int = 512,
         prediction_tokens: int | None = None,
         thought_tokens: int | None = None,
@@ -182,12 +181,12 @@ class ReasoningViaPlanning(Stateless):
         self.output = output
         self.temperature = temperature
         self.limits = {"calls": max_calls, "tokens": max_search_tokens}
-        self.memory_tokens, self.path_tokens = memory_tokens, path_tokens
+        self.path_tokens = path_tokens
         self.prediction_tokens = chosen["prediction_tokens"]
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
         meter = Meter(self.services.llm, **self.limits)
         problem = ImaginedProblem(self, meter, base, input.action_schema)

@@ -35,7 +35,6 @@ class ReAct:
 
     Args:
         max_iterations: consecutive thoughts before the action is asked for alone.
-        memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of a thought (``None``: the spec's ``max_tokens``).
         history: steps of transcript shown in the ``snapshot`` layout.
     """
@@ -44,7 +43,6 @@ class ReAct:
         self,
         services: Services,
         max_iterations: int = 10,
-        memory_tokens: int = 512,
         thought_tokens: int | None = None,
         history: int = 10,
     ) -> None:
@@ -52,7 +50,6 @@ class ReAct:
             raise ValueError(f"react: max_iterations must be at least 1, got {max_iterations}")
         self.services = services
         self.max_iterations = max_iterations
-        self.memory_tokens = memory_tokens
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self.history = history
         self._transcript: list[str] = []
@@ -80,7 +77,7 @@ class ReAct:
         return self._decision(action, thoughts, call, "\n".join(t.text for t in thoughts))
 
     def _dynamic(self, input: AgentInput, recall: Recall) -> str:
-        text = user_turn(input, recall, self.services, self.memory_tokens)
+        text = user_turn(input, recall, self.services)
         if self.services.context.layout == "snapshot" and self._transcript:
             return "Transcript so far:\n" + "\n".join(self._transcript[-self.history :]) + f"\n\n{text}"
         return text

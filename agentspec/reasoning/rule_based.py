@@ -1,19 +1,22 @@
-"""Reasoners without a model: DeliveryBench's scripted expert, and a random sensible action.
+"""Reasoners without a model: the environment's scripted expert, and a random sensible action.
 
 They mark the ceiling that rules reach and the floor, and the expert's episodes serve as demonstrations for a warm
-start. Both answer in the environment's language: a choice of the menu where there is one, a native call otherwise.
+start. Both answer in the environment's language: a choice of the menu where there is one, a native call otherwise. Who
+plays is declared by the environment (see `agentspec.envs.experts`).
 """
 
 from __future__ import annotations
 
+import json
+import random
+from collections.abc import Mapping
+from typing import Any
+
 from agentspec.actions import parse_action
-from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier, Style
-from agentspec.envs.deliverybench.env import city_of
+from agentspec.envs.experts import NoPlayer, Player, player
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
 from agentspec.types import Action, AgentInput, Decision, Recall, Task
-
-CITY_OPTIONS = ("map", "size", "city_seed")
 
 
 def decision(text: str, input: AgentInput, rationale: str) -> Decision:
@@ -22,23 +25,31 @@ def decision(text: str, input: AgentInput, rationale: str) -> Decision:
     return Decision(action, rationale=rationale, valid=isinstance(action, Action))
 
 
+def _player(task: Task, role: str, rng: random.Random, parameters: Mapping[str, Any]) -> Player:
+    from agentspec.episode import environment_id
+
+    return player(environment_id(task.env), role, task.options, rng, **parameters)
+
+
 class RuleBased(Stateless):
-    """The rule-based courier of DeliveryBench (see `agentspec.envs.deliverybench.courier`).
+    """The scripted expert of the task's environment.
 
     Args:
-        bagging: pack food into the bag after every pick-up.
-        hasty: move at the accelerated pace while nothing fragile is carried.
+        parameters: of the expert, as its environment documents them; for DeliveryBench `bagging` and `hasty`.
     """
 
-    def __init__(self, services: Services, bagging: bool = True, hasty: bool = True) -> None:
+    def __init__(self, services: Services, parameters: Mapping[str, Any] | None = None) -> None:
         self.services = services
-        self.style = Style(bagging=bagging, hasty=hasty)
-        self.courier: RuleBasedCourier | None = None
+        self.parameters = dict(parameters or {})
+        self.player: Player | None = None
 
     def begin_episode(self, task: Task) -> None:
-        """Take the map of the task's city."""
-        options = {name: task.options[name] for name in CITY_OPTIONS if name in task.options}
-        self.courier = RuleBasedCourier(city_of(**options), self.style)
+        """Ask the task's environment for its expert.
+
+        Raises:
+            NoPlayer: it has none.
+        """
+        self.player = _player(task, "rule_based", self.services.rng, self.parameters)
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         """The expert's next action.
@@ -46,38 +57,49 @@ class RuleBased(Stateless):
         Raises:
             RuntimeError: before `begin_episode`.
         """
-        if self.courier is None:
-            raise RuntimeError("rule_based: begin_episode(task) must come before decide(), it names the city")
-        text = self.courier.act({"state": input.state, "action_schema": input.action_schema})
-        return decision(text, input, "insertion heuristic")
+        if self.player is None:
+            raise RuntimeError("rule_based: begin_episode(task) must come before decide(), it names the environment")
+        text = self.player.act({"state": input.state, "action_schema": input.action_schema})
+        return decision(text, input, "scripted expert")
 
     def snapshot(self) -> bytes:
-        """The round the courier is on."""
-        return b"" if self.courier is None else self.courier.snapshot()
+        """What the expert remembers."""
+        return b"" if self.player is None else self.player.snapshot()
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot` of the same episode."""
-        if blob and self.courier is not None:
-            self.courier.restore(blob)
+        if blob and self.player is not None:
+            self.player.restore(blob)
 
 
 class RandomLegal(Stateless):
-    """A random one of the actions that make sense now: of the menu where there is one, else of the menu's calls."""
+    """A random one of the actions that make sense now: of the menu where there is one, else the environment's own."""
 
     def __init__(self, services: Services) -> None:
-        self.courier = RandomCourier(services.rng)
+        self.services = services
+        self.player: Player | None = None
+
+    def begin_episode(self, task: Task) -> None:
+        """Ask the task's environment for its random player, if it has one."""
+        try:
+            self.player = _player(task, "random", self.services.rng, {})
+        except NoPlayer:
+            self.player = None
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         """A uniform draw from the services' own generator."""
         schema = input.action_schema
-        if not schema.choices and "offers" not in input.state:
-            raise ValueError("random: this environment offers neither a menu nor DeliveryBench's state; use menu mode")
-        return decision(self.courier.act({"state": input.state, "action_schema": schema}), input, "random")
+        if schema.choices:
+            return decision(self.services.rng.choice(schema.choices), input, "random")
+        if self.player is None:
+            raise ValueError("random: this environment offers neither a menu nor a random player; use menu mode")
+        return decision(self.player.act({"state": input.state, "action_schema": schema}), input, "random")
 
     def snapshot(self) -> bytes:
         """The state of the generator."""
-        return self.courier.snapshot()
+        return json.dumps(self.services.rng.getstate()).encode()
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`."""
-        self.courier.restore(blob)
+        version, internal, gauss = json.loads(blob)
+        self.services.rng.setstate((version, tuple(internal), gauss))

@@ -82,7 +82,6 @@ class SelfConsistency(Stateless):
         sampling_temperature: temperature of the chains; above 0, or they would not be independent.
         credit: which completions are credited as executed: those of the answer ``returned``, or of the whole
             ``majority``; the others are credited as explored.
-        memory_tokens: budget of what memory adds to the prompt.
         thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
     """
 
@@ -93,7 +92,6 @@ class SelfConsistency(Stateless):
         samples: int | None = None,
         sampling_temperature: float = 0.7,
         credit: str = "returned",
-        memory_tokens: int = 512,
         thought_tokens: int | None = None,
     ) -> None:
         chosen = settings("self_consistency", PRESETS, preset, {"samples": samples})
@@ -108,13 +106,12 @@ class SelfConsistency(Stateless):
         self.services = services
         self.samples: int = chosen["samples"]
         self.credit = credit
-        self.memory_tokens = memory_tokens
         self.sampling: dict[str, Any] = {"temperature": sampling_temperature}
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         schema = input.action_schema
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         messages = self.services.context.prompt(
             static_prompt(input, THINK if schema.choices else THINK_THEN_CALL), dynamic
         )

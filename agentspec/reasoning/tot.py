@@ -102,7 +102,7 @@ class TreeOfThoughts(Stateless):
         temperature: of all calls.
         max_calls: most requests per decision (``None``: no limit).
         max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
-        memory_tokens, course_tokens: budgets of prompt sections.
+        course_tokens: budgets of prompt sections.
         thought_tokens: most tokens of a proposal or a judgement (``None``: the spec's ``max_tokens``).
     """
 
@@ -122,7 +122,6 @@ class TreeOfThoughts(Stateless):
         temperature: float = 0.7,
         max_calls: int | None = None,
         max_search_tokens: int | None = None,
-        memory_tokens: int = 512,
         course_tokens: int = 256,
         thought_tokens: int | None = None,
     ) -> None:
@@ -149,10 +148,10 @@ class TreeOfThoughts(Stateless):
         if thought_tokens is not None:
             self.sampling["max_tokens"] = thought_tokens
         self.limits = {"calls": max_calls, "tokens": max_search_tokens}
-        self.memory_tokens, self.course_tokens = memory_tokens, course_tokens
+        self.course_tokens = course_tokens
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
-        dynamic = user_turn(input, recall, self.services, self.memory_tokens)
+        dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
         search = Search(base, input.action_schema, Meter(self.services.llm, **self.limits))
         root = Node()

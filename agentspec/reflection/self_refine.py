@@ -74,7 +74,6 @@ class SelfRefine:
         max_iterations: most pairs of feedback and refinement.
         feedback_tokens: most tokens of a feedback.
         history_tokens: budget of attempts and feedback in a prompt; the oldest go first.
-        memory_tokens: budget of what memory adds to a prompt.
     """
 
     def __init__(
@@ -84,7 +83,6 @@ class SelfRefine:
         max_iterations: int | None = None,
         feedback_tokens: int | None = None,
         history_tokens: int = 512,
-        memory_tokens: int = 256,
     ) -> None:
         given = {"max_iterations": max_iterations, "feedback_tokens": feedback_tokens}
         chosen: dict[str, int] = settings("self_refine", PRESETS, preset, given)
@@ -93,7 +91,6 @@ class SelfRefine:
         self.max_iterations = chosen["max_iterations"]
         self.feedback_tokens = chosen["feedback_tokens"]
         self.history_tokens = history_tokens
-        self.memory_tokens = memory_tokens
 
     def begin_episode(self, task: Task) -> None:
         return None
@@ -103,7 +100,7 @@ class SelfRefine:
 
     async def revise(self, input: AgentInput, recall: Recall, decision: Decision) -> Decision:
         """The decision, refined; as far as the budget allows."""
-        draft = Draft(input, user_turn(input, recall, self.services, self.memory_tokens), decision)
+        draft = Draft(input, user_turn(input, recall, self.services), decision)
         draft.attempt(_shown(decision.action))
         try:
             await self._refine(draft)

@@ -51,11 +51,9 @@ class TrialLog:
         return cls(data["trials"], data["best"], [(number, text) for number, text in data["lessons"]])
 
     def recall(self, last: int, source: str) -> Recall:
-        """The ``last`` lessons, in the order they were learnt."""
-        shown = [TRIAL.format(number=number, lesson=lesson) for number, lesson in self.lessons[-last:]]
-        if shown:
-            shown[0] = f"{HEADER}\n{shown[0]}"
-        return Recall(tuple(RecallItem(text, kind="lesson", source=source) for text in shown))
+        """The ``last`` lessons, in the order they were learnt; the newest matter most."""
+        shown = [(TRIAL.format(number=number, lesson=text), number) for number, text in self.lessons[-last:]]
+        return Recall(tuple(RecallItem(text, kind="lesson", source=source, priority=n) for text, n in shown))
 
 
 def episode_return(trajectory: Trajectory) -> float:

@@ -96,7 +96,8 @@ def test_only_the_last_lessons_are_shown_in_order() -> None:
     run(reflexion, *(trial(0.0) for _ in range(5)))
     lines = shown(reflexion, task)
     assert [line.split("\n")[-1] for line in lines] == [f"Trial {i}: lesson {i}" for i in (2, 3, 4)]
-    assert lines[0].startswith("Lessons from earlier trials")
+    recall = asyncio.run(reflexion.lessons(INPUT))
+    assert Context().recalled(recall).startswith("Lessons from earlier trials")
 
 
 def test_lessons_are_kept_by_task_or_by_family() -> None:

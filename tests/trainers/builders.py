@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from agentspec.trajectory import Trajectory
@@ -76,3 +76,10 @@ def episode(calls: list[LLMCall], rewards: Sequence[float] = (0.0,), *, status: 
             )
         )
     return Trajectory(Task("toy", 0), {}, rollout, transitions=tuple(transitions), calls=tuple(calls), status=status)
+
+
+def instead_of_playing(build: Callable[[Any], Sequence[Trajectory]]) -> Callable[..., Any]:
+    """What a trainer plays with (`trainers.rollouts.collect`), giving episodes that were built: jobs -> episodes."""
+    from trainers.credit import ScoredEpisode
+
+    return lambda runner, jobs, rewards, **_: [ScoredEpisode(t, rewards.score(t)) for t in build(jobs)]

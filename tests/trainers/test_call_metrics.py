@@ -12,11 +12,11 @@ pytest.importorskip("trl")
 
 from tests.trainers.builders import call, episode
 from tests.trainers.test_resume import trainer
-from trainers.batches import Row, collate
+from trainers.batches import collate
 from trainers.call_metrics import CallMetrics, clipped_tokens
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.runlog import RunLog
-from trainers.sequences import TrainFilter, build_sequences
+from trainers.sequences import Row, TrainFilter, build_sequences
 
 ACT, SUM = "reasoning.direct/act", "memory.summary/summarise"
 

@@ -30,7 +30,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
-from tests.trainers.builders import call, episode
+from tests.trainers.builders import call, episode, instead_of_playing
 from trainers import grpo as grpo_module
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
@@ -125,7 +125,7 @@ def run_cases(out: Path, processes: int) -> None:
     for case in CASES:
         built = case not in ("played", "carried", "cut")
         grpo_module.collect = (  # type: ignore[assignment]
-            (lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs]) if built else collect
+            instead_of_playing(lambda jobs, case=case: [built_episode(case, j) for j in jobs]) if built else collect
         )
         trainer = make_trainer(out / case, case)
         assert trainer.accelerator.num_processes == processes

@@ -30,7 +30,7 @@ from trl.distributed import DistributedBackend
 
 from agentspec.registry import SpecError
 from tests.tiny import tiny_tokenizer
-from tests.trainers.builders import call, episode
+from tests.trainers.builders import call, episode, instead_of_playing
 from tests.trainers.fake_vllm import use_fake_vllm
 from tests.trainers.test_data_parallel import built_episode, make_trainer
 from tests.trainers.test_supo import configured
@@ -192,7 +192,7 @@ def run_cases(out: Path, name: str) -> None:
         patch.setattr(
             grpo_module,
             "collect",
-            lambda runner, jobs, *, case=case, **_: [built_episode(case, j) for j in jobs],
+            instead_of_playing(lambda jobs, case=case: [built_episode(case, j) for j in jobs]),
         )
         trainer = make_trainer(out / case, case, use_vllm=True, vllm_importance_sampling_correction=False)
         backend = DistributedBackend(trainer.accelerator)
@@ -221,7 +221,7 @@ def step_in_bfloat16() -> None:
 
     patch = pytest.MonkeyPatch()
     patch.setattr(grpo_module, "rows_logprobs", checked)
-    patch.setattr(grpo_module, "collect", lambda runner, jobs, **_: [built_episode("tree", j) for j in jobs])
+    patch.setattr(grpo_module, "collect", instead_of_playing(lambda jobs: [built_episode("tree", j) for j in jobs]))
     settings = {"use_vllm": True, "bf16": True, "max_steps": 1}
     make_trainer(Path(sys.argv[2]), "tree", **settings).train()
 
@@ -231,12 +231,12 @@ def fail_alone() -> None:
     trainer = make_trainer(Path(sys.argv[2]), "tree")
     rank = trainer.accelerator.process_index
 
-    def collect(runner: Any, jobs: Any, **_: Any) -> Any:
+    def play(jobs: Any) -> Any:
         if rank == 1:
             raise SpecError("rank 1 cannot play")
         return [built_episode("tree", j) for j in jobs]
 
-    pytest.MonkeyPatch().setattr(grpo_module, "collect", collect)
+    pytest.MonkeyPatch().setattr(grpo_module, "collect", instead_of_playing(play))
     trainer.train()
 
 

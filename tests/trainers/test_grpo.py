@@ -22,13 +22,13 @@ from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
-from tests.trainers.builders import call, episode
+from tests.trainers.builders import call, episode, instead_of_playing
 from trainers import grpo as grpo_module
-from trainers.batches import Row, collate, rows_logprobs
+from trainers.batches import collate, rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.rollouts import task_rows
-from trainers.sequences import build_sequences
+from trainers.sequences import Row, build_sequences
 
 GROUPS, GENERATIONS = 2, 4
 RETURNS = [15.0, 10.0, 5.0, 15.0, 1.0, 0.0, 0.0, 0.5]
@@ -105,7 +105,7 @@ def ours(tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any
         processing_class=tokenizer,
         make_llm=lambda model, tokenizer: object.__new__(type("Unused", (LLM,), {})),
     )
-    monkeypatch.setattr(grpo_module, "collect", lambda runner, jobs, **_: episodes)
+    monkeypatch.setattr(grpo_module, "collect", instead_of_playing(lambda jobs: episodes))
     return spied(trainer)
 
 
@@ -117,7 +117,7 @@ def relative_difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) 
 
 @pytest.mark.parametrize("loss_type", ["dapo", "cispo", "grpo", "dr_grpo", "bnpo"])
 def test_single_sequence_work_equals_stock_trl(tmp_path: Any, monkeypatch: Any, loss_type: str) -> None:
-    episodes = [episode(random_calls(i, turns=3), [r], rollout=i % 4) for i, r in enumerate(RETURNS)]
+    episodes = [episode(random_calls(i, turns=3), [0.0, 0.0, r], rollout=i % 4) for i, r in enumerate(RETURNS)]
     # bnpo normalises each micro-batch by its own tokens: only one micro-batch makes the comparison well defined.
     one = {"per_device_train_batch_size": 8, "gradient_accumulation_steps": 1} if loss_type == "bnpo" else {}
     spy = ours(tmp_path / "ours", episodes, monkeypatch, loss_type=loss_type, **one)

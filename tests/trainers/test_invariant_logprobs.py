@@ -17,10 +17,10 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.models import ModelNotFoundError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
-from trainers.batches import Row, collate, rows_logprobs
+from trainers.batches import collate, rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.policy import load_policy
-from trainers.sequences import build_sequences
+from trainers.sequences import Row, build_sequences
 from trainers.tree import enable_tree
 
 WORLD = {"size": "tiny", "observation": "compact", "shift_hours": 0.3, "max_steps": 2}

@@ -20,6 +20,7 @@ from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
 from tests.trainers.builders import CPU_RUN
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.retroformer import as_retroformer
 from trainers.rollouts import rollout_jobs, starting_states, task_rows
@@ -39,9 +40,9 @@ class Watched(ScaffoldGRPOTrainer):
 
     rounds: list[tuple[list[Job], list[Trajectory]]]
 
-    def _play(self, jobs: Any, spec: Any = None) -> list[Trajectory]:
+    def _play(self, jobs: Any, spec: Any = None) -> list[ScoredEpisode]:
         episodes = super()._play(jobs, spec)
-        self.__dict__.setdefault("rounds", []).append((list(jobs), episodes))
+        self.__dict__.setdefault("rounds", []).append((list(jobs), [e.trajectory for e in episodes]))
         return episodes
 
 

@@ -16,20 +16,20 @@ from hypothesis import strategies as st
 
 pytest.importorskip("trl")
 
+
 from agentspec.registry import SpecError
 from agentspec.types import Completion
 from rewards import RewardSet
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
-from tests.trainers.test_supo import configured, played
-from trainers.batches import Row, blank_row, collate, deal
+from tests.trainers.test_supo import configured, credited, played
+from trainers.batches import blank_row, collate, deal
 from trainers.config import EXACT_LOSSES, ROW_LOSSES
 from trainers.runlog import RunLog
-from trainers.sequences import TokenSequence
-from trainers.weighing import weigh
+from trainers.sequences import Row, TokenSequence
 
 COVERED = {
-    "1 normalising over rows": ["test_advantages.py::test_rows_per_episode_do_not_move_the_baseline"],
+    "1 normalising over rows": ["test_credit.py::test_rows_per_episode_do_not_move_the_baseline"],
     "2 the last row as representative": ["test_pitfalls.py::test_an_untrained_last_segment_silences_nothing"],
     "3 broadcast by position": ["test_pitfalls.py::test_every_row_keeps_its_own_advantage_however_it_is_dealt"],
     "4 wrong group key": ["test_pitfalls.py::test_a_group_is_one_task_played_by_all_its_rollouts"],
@@ -50,7 +50,7 @@ COVERED = {
     "13 only the last segment reported": ["test_pitfalls.py::test_metrics_are_of_the_whole_episode"],
     "14 overlong rollouts in the baseline": ["test_supo.py::test_overlong_episodes"],
     "15 early stops are not overlong": ["test_supo.py::test_which_ends_are_overlong"],
-    "16 equal up to float noise": ["test_advantages.py::test_groups_without_signal_get_exactly_zero"],
+    "16 equal up to float noise": ["test_estimators.py::test_groups_without_signal_get_exactly_zero"],
 }
 
 
@@ -73,9 +73,9 @@ def test_an_untrained_last_segment_silences_nothing(tmp_path: Path) -> None:
 
     settings = {"train_calls": ["reasoning.*", "memory.summary"], "mask_truncated": ["memory.summary"]}
     config = configured(tmp_path, num_generations=2, **settings)
-    weighed = weigh([rollout(1.0, 0), rollout(0.0, 1)], config, RewardSet(), group=2)
+    result = credited([rollout(1.0, 0), rollout(0.0, 1)], config)
     # Deviation of (1, 0) is .7071: .5 / (.7071 + 1e-4) = .707.
-    assert [(r.episode, round(r.advantage, 3)) for r in weighed.rows] == [(0, 0.707), (1, -0.707)]  # type: ignore[arg-type]
+    assert [(r.episode, round(r.advantage, 3)) for r in result.rows] == [(0, 0.707), (1, -0.707)]  # type: ignore[arg-type]
 
 
 def _row(number: int, length: int) -> Row:
@@ -119,11 +119,11 @@ def test_a_group_is_one_task_played_by_all_its_rollouts(tmp_path: Path) -> None:
 
 def test_nothing_to_learn_is_no_nan(tmp_path: Path) -> None:
     nobody = [episode([call(0, [1], [2])], [1.0], status="failed", rollout=i) for i in range(4)]
-    weighed = weigh(nobody, configured(tmp_path), RewardSet(), group=4)
-    assert weighed.rows == []
-    assert all(torch.tensor(v).isfinite() for v in weighed.metrics.values())
+    result = credited(nobody, configured(tmp_path))
+    assert result.rows == []
+    assert all(torch.tensor(v).isfinite() for v in result.metrics.values())
     silent = [episode([], [1.0], rollout=i) for i in range(4)]
-    assert weigh(silent, configured(tmp_path), RewardSet(), group=4).rows == []
+    assert credited(silent, configured(tmp_path)).rows == []
 
 
 def test_losses_that_weigh_rows_are_named_or_refused(tmp_path: Path) -> None:
@@ -141,12 +141,12 @@ def test_the_denominator_counts_what_is_trained(tmp_path: Path) -> None:
     """Blank rows have no trained token; rows without gradient count unless their groups are skipped by choice."""
     values = [1.0, 1.0, 0.0, 1.0]  # the first group has no variance
     episodes = [episode([call(0, [1, i], [2] * (i + 1))], [v], rollout=i % 2) for i, v in enumerate(values)]
-    kept = weigh(episodes, configured(tmp_path, num_generations=2), RewardSet(), group=2)
-    skipped = weigh(episodes, configured(tmp_path, num_generations=2, skip_zero_variance=True), RewardSet(), group=2)
+    kept = credited(episodes, configured(tmp_path, num_generations=2))
+    skipped = credited(episodes, configured(tmp_path, num_generations=2, skip_zero_variance=True))
     assert kept.metrics["rollouts/trained_tokens"] == 1 + 2 + 3 + 4
     assert skipped.metrics["rollouts/trained_tokens"] == 3 + 4
     assert kept.metrics["groups/zero_variance"] == skipped.metrics["groups/zero_variance"] == 0.5
-    assert blank_row(0).sequence.trained == 0 and blank_row(0).silent
+    assert blank_row(0).sequence.trained == 0 and blank_row(0).zero_gradient
 
 
 def test_the_logged_denominator_is_that_of_the_loss(tmp_path: Path) -> None:
@@ -161,6 +161,6 @@ def test_metrics_are_of_the_whole_episode() -> None:
     # Seven steps in three segments: the return is the sum over all of them.
     (seller, waiter) = played(steps=7)
     assert seller.metrics["steps"] == waiter.metrics["steps"] == 7
-    assert seller.metrics["return"] == sum(t.reward for t in seller.transitions) == RewardSet().total(seller)
+    assert seller.metrics["return"] == sum(t.reward for t in seller.transitions) == RewardSet().score(seller).total
     assert seller.metrics["return"] > max(t.reward for t in seller.transitions[-1:]) and waiter.metrics["return"] == 0
     assert seller.metrics["llm_calls"] == 7 + 2

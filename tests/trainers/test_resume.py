@@ -18,13 +18,12 @@ from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
 from tests.trainers.builders import CPU_RUN, call, episode
 from trainers.audit import audit
-from trainers.batches import Row
 from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import ScaffoldState, checkpoints, last_complete_checkpoint, load_state, save_state, set_aside
 from trainers.rollouts import task_rows
 from trainers.runlog import RunLog
-from trainers.sequences import build_sequences
+from trainers.sequences import Row, build_sequences
 
 
 def trainer(folder: Path, *, held_out: Sequence[Task] = (), **changes: Any) -> ScaffoldGRPOTrainer:

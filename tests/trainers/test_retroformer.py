@@ -27,13 +27,14 @@ from tests.trainers.builders import CPU_RUN, call, episode
 from tests.trainers.played import toy_tasks
 from tests.trainers.test_resume import _stop_after
 from trainers.audit import audit
-from trainers.batches import Row, rows_logprobs
+from trainers.batches import rows_logprobs
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 from trainers.policy import ACTOR, TRAINED, load_actor_and_reflector, load_policy
 from trainers.retroformer import RetroformerTrainer, as_retroformer, play_trials
 from trainers.rollouts import task_rows
 from trainers.runlog import RunLog
-from trainers.sequences import TrainFilter, build_sequences
+from trainers.sequences import Row, TrainFilter, build_sequences
 
 AGENT = {
     "reasoning": "direct",
@@ -139,7 +140,7 @@ def test_a_group_reflects_on_one_failed_trial(trained: Any) -> None:
             # The change of return, by what was recorded of the two trials.
             total = sum(t.reward for t in trajectory.transitions) - sum(t.reward for t in first.transitions)
             assert trajectory.metrics["reflection/reward"] == pytest.approx(total)
-            assert RewardSet({"reflection_gain": 1.0}).total(trajectory) == pytest.approx(total)
+            assert RewardSet({"reflection_gain": 1.0}).score(trajectory).total == pytest.approx(total)
             assert {c.sampling.temperature for c in trajectory.calls if c is not lesson} == {0.9}
             assert lesson.sampling.temperature == 1.0
             # And the lesson stands in what the actor reads.
@@ -244,9 +245,9 @@ def test_trials_of_groups(tmp_path: Path) -> None:
     asked: list[list[Job]] = []
     fates = {0: "due", 1: "good", 2: "failed", 3: "due"}
 
-    def play(jobs: Sequence[Job]) -> list[Trajectory]:
+    def play(jobs: Sequence[Job]) -> list[ScoredEpisode]:
         asked.append(list(jobs))
-        return [
+        trajectories = [
             Trajectory(
                 job.task,
                 {},
@@ -258,9 +259,11 @@ def test_trials_of_groups(tmp_path: Path) -> None:
             )
             for job in jobs
         ]
+        return [ScoredEpisode(t, RewardSet({"env": 1.0}).score(t)) for t in trajectories]
 
     jobs = [Job(Task("toy", seed), rollout, 5) for seed in fates for rollout in range(2)]
-    firsts, episodes = play_trials(play, jobs)
+    scored_firsts, scored = play_trials(play, jobs)
+    firsts, episodes = [e.trajectory for e in scored_firsts], [e.trajectory for e in scored]
     assert [t.task.seed for t in firsts] == [0, 1, 2, 3]
     heads, followed = asked
     assert {h.seed for h in heads}.isdisjoint({j.seed for j in jobs})  # other draws than those of the next trial
@@ -279,7 +282,9 @@ def test_the_actor_is_greedy_by_default_and_lessons_are_sampled(folders: dict[st
     firsts, _ = logged(tmp_path, 0)
     again = run._play([Job(t.task, 0, 77) for t in firsts])
     assert len(again) == 2
-    assert [t.action_text for t in run._first_trials[0].transitions] == [t.action_text for t in firsts[0].transitions]
+    assert [t.action_text for t in run._first_trials[0].trajectory.transitions] == [
+        t.action_text for t in firsts[0].transitions
+    ]
 
 
 def test_validation_plays_two_trials(tmp_path: Path, folders: dict[str, str]) -> None:
@@ -287,7 +292,7 @@ def test_validation_plays_two_trials(tmp_path: Path, folders: dict[str, str]) ->
     before = weights(run)
     metrics = run.evaluate()
     assert metrics == run.evaluate() and metrics["eval_unscorable"] == 0.0
-    gains = {t.task.key: sum(s.reward for s in t.transitions) for t in run._first_trials}
+    gains = {t.task.key: sum(s.reward for s in t.transitions) for t in (e.trajectory for e in run._first_trials)}
     assert len(gains) == 2 and metrics["eval_llm_calls"] == 4.0  # three actions, and a lesson before them
     assert all(torch.equal(before[n], w) for n, w in weights(run).items())
 
@@ -299,8 +304,8 @@ def test_the_gain_per_step_sums_to_the_change_of_return() -> None:
     paid = replace(episode([call(0, [1], [2])], (2.0, 0.5, 1.0)), metrics={"reflection/return_before": 1.25})
     gain = RewardSet({"reflection_gain": 1.0})
     # 2 - 1.25, 0.5, 1: in all 3.5 - 1.25.
-    assert gain.steps(paid) == {"reflection_gain": (0.75, 0.5, 1.0)} and gain.total(paid) == 2.25
-    assert gain.total(replace(paid, metrics={})) == 0.0 and gain.total(replace(paid, status="failed")) is None
+    assert gain.score(paid).terms == {"reflection_gain": (0.75, 0.5, 1.0)} and gain.score(paid).total == 2.25
+    assert gain.score(replace(paid, metrics={})).total == 0.0 and gain.score(replace(paid, status="failed")) is None
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

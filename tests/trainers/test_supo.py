@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,16 @@ from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from recipes.common import CONFIGS, parse_config
-from rewards import RewardSet
 from tests.toy_env import TOY
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_trainer
 from trainers.audit import audit
+from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
+from trainers.credit import Credited, CreditRule, is_overlong
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
 from trainers.supo import as_supo
-from trainers.weighing import is_overlong, weigh
 
 SUPO = {
     "agent": {"reasoning": "direct", "memory": {"name": "summary", "every": 3}},
@@ -38,6 +39,11 @@ SUPO = {
 def configured(tmp_path: Path, **changes: Any) -> ScaffoldConfig:
     settings = {"output_dir": str(tmp_path), "use_cpu": True, "bf16": False, "num_generations": 4, **changes}
     return ScaffoldConfig(per_device_train_batch_size=4, report_to=[], **settings)
+
+
+def credited(episodes: Sequence[Trajectory], config: ScaffoldConfig) -> Credited:
+    rule = CreditRule.from_config(config)
+    return rule.credit(rule.score(episodes))
 
 
 # --- the configuration -----------------------------------------------------------------------------------------------
@@ -108,22 +114,22 @@ def ended(how: str, i: int, *, truncated: bool = False) -> Trajectory:
 def test_overlong_episodes(tmp_path: Path, overlong: str, expected: list[float | None]) -> None:
     episodes = [ended("context" if i == 1 else "environment", i) for i in range(4)]
     config = configured(tmp_path, overlong=overlong)
-    weighed = weigh(episodes, config, RewardSet(), group=4)
-    assert weighed.metrics["rollouts/overlong"] == 0.25
+    result = credited(episodes, config)
+    assert result.metrics["rollouts/overlong"] == 0.25
     got: dict[int, set[float]] = {}
-    for row in weighed.rows:
+    for row in result.rows:
         got.setdefault(row.episode, set()).add(round(row.advantage, 3))  # type: ignore[arg-type]
     # One advantage for both segments of a rollout.
     assert got == {i: {a} for i, a in enumerate(expected) if a is not None}
-    assert len(weighed.rows) == 2 * len(got)
+    assert len(result.rows) == 2 * len(got)
 
 
 def test_an_overlong_episode_without_loss_is_no_failure(tmp_path: Path) -> None:
     """Overlong counts as overlong, failed as unscorable: not both."""
     episodes = [ended("context", 0), replace(ended("failure", 1), status="failed"), ended("environment", 2)]
-    weighed = weigh([*episodes, ended("environment", 3)], configured(tmp_path), RewardSet(), group=4)
-    assert weighed.metrics["rollouts/overlong"] == 0.25 and weighed.metrics["rollouts/unscorable"] == 0.25
-    assert {r.episode for r in weighed.rows} == {2, 3}
+    result = credited([*episodes, ended("environment", 3)], configured(tmp_path))
+    assert result.metrics["rollouts/overlong"] == 0.25 and result.metrics["rollouts/unscorable"] == 0.25
+    assert {r.episode for r in result.rows} == {2, 3}
 
 
 def test_which_ends_are_overlong() -> None:
@@ -156,12 +162,12 @@ def played(
 def test_summary_tokens_get_the_advantage_of_their_rollout(tmp_path: Path) -> None:
     episodes = played()
     config = configured(tmp_path, num_generations=2, **SUPO)
-    weighed = weigh(episodes, config, RewardSet(), group=2)
+    result = credited(episodes, config)
     # 7 actions, summaries after the 3rd and the 6th: three segments each.
-    assert [r.episode for r in weighed.rows] == [0, 0, 0, 1, 1, 1]
+    assert [r.episode for r in result.rows] == [0, 0, 0, 1, 1, 1]
     # Two rollouts: deviation |a - b| / sqrt 2, so the advantages are +-0.707.
-    assert [round(r.advantage, 3) for r in weighed.rows] == [0.707] * 3 + [-0.707] * 3  # type: ignore[arg-type]
-    for t, rows in ((t, [r for r in weighed.rows if r.episode == i]) for i, t in enumerate(episodes)):
+    assert [round(r.advantage, 3) for r in result.rows] == [0.707] * 3 + [-0.707] * 3  # type: ignore[arg-type]
+    for t, rows in ((t, [r for r in result.rows if r.episode == i]) for i, t in enumerate(episodes)):
         summaries = {c.id: c for c in t.calls if c.tag.purpose == "summary"}
         assert len(summaries) == 2
         for row in rows[:2]:
@@ -190,10 +196,10 @@ def test_truncated_summaries_are_counted_and_masked(tmp_path: Path) -> None:
     kept = configured(tmp_path, num_generations=2, **SUPO)
     counts = []
     for config in (masked, kept):
-        weighed = weigh(episodes, config, RewardSet(), group=2)
-        assert weighed.metrics["calls/memory.summary/summary/truncated"] == 1.0
-        assert weighed.metrics["calls/reasoning.direct/act/truncated"] == 0.0
-        counts.append(weighed.metrics["rollouts/trained_tokens"])
+        result = credited(episodes, config)
+        assert truncated_calls(episodes, config.train_filter)["calls/memory.summary/summary/truncated"] == 1.0
+        assert truncated_calls(episodes, config.train_filter)["calls/reasoning.direct/act/truncated"] == 0.0
+        counts.append(result.metrics["rollouts/trained_tokens"])
     assert counts[1] - counts[0] == 2 * 2 * 5  # two episodes, two summaries of five tokens
 
 
@@ -211,8 +217,8 @@ def test_an_episode_that_runs_out_of_context_after_a_summary_is_overlong(tmp_pat
     for estimator in ("grpo", "reward_to_go"):
         for overlong, rows in (("mask", 0), ("drop", 0), ("keep", 4)):
             config = configured(tmp_path, num_generations=2, overlong=overlong, estimator=estimator, **SUPO)
-            weighed = weigh(episodes, config, RewardSet(), group=2)
-            assert len(weighed.rows) == rows and weighed.metrics["rollouts/overlong"] == 1.0
+            result = credited(episodes, config)
+            assert len(result.rows) == rows and result.metrics["rollouts/overlong"] == 1.0
 
 
 def test_supo_trains(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from tests.toy_env import TOY
 from tests.trainers.builders import call, episode
 from tests.trainers.test_resume import trainer, weights
 from trainers.config import ScaffoldConfig
+from trainers.credit import ScoredEpisode
 from trainers.rollouts import task_rows
 from trainers.runlog import RunLog
 from trainers.validation import validate, validation_scaffolds
@@ -98,7 +99,7 @@ def test_ranks_share_the_tasks_and_agree() -> None:
     spec = AgentSpec.from_data({"reasoning": "rule_based"})
     jobs = [Job(t) for t in HELD_OUT] + [Job(replace(HELD_OUT[0], seed=99))]
 
-    def play(_: AgentSpec, mine: Any) -> list[Any]:
+    def played(mine: Any) -> list[Any]:
         return [
             replace(
                 episode([call(0, [1], [2])], [float(j.task.seed)]),
@@ -107,20 +108,22 @@ def test_ranks_share_the_tasks_and_agree() -> None:
             for j in mine
         ]
 
-    rewards = RewardSet({"env": 1.0})
+    def play(_: AgentSpec, mine: Any) -> list[Any]:
+        return [ScoredEpisode(t, RewardSet({"env": 1.0}).score(t)) for t in played(mine)]
+
     parts: list[Any] = []
 
     def first(rows: list[Any]) -> list[Any]:
         parts.extend(rows)
         return rows
 
-    one = validate({"": spec}, jobs, play, rewards)
-    validate({"": spec}, jobs, play, rewards, rank=0, ranks=2, gather=first)
-    two = validate({"": spec}, jobs, play, rewards, rank=1, ranks=2, gather=lambda rows: parts + rows)
+    one = validate({"": spec}, jobs, play)
+    validate({"": spec}, jobs, play, rank=0, ranks=2, gather=first)
+    two = validate({"": spec}, jobs, play, rank=1, ranks=2, gather=lambda rows: parts + rows)
     assert one == two
     assert one["reward"] == pytest.approx(sum(t.seed for t in HELD_OUT) / 4)
     assert one["unscorable"] == pytest.approx(1 / 5)
-    failed = validate({"": spec}, jobs[-1:], play, rewards)
+    failed = validate({"": spec}, jobs[-1:], play)
     assert math.isnan(failed["reward"]) and failed["unscorable"] == 1
 
 

@@ -17,7 +17,7 @@ import string
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
@@ -25,15 +25,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
-from agentspec.envs.deliverybench.citymap import City, load_city
-from agentspec.envs.deliverybench.events import Progress, events_since
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.menu import Option, options
-from agentspec.envs.deliverybench.observation import around, compact_text, full_text, instruction
-from agentspec.envs.deliverybench.rules import Rules, rules_named
-from agentspec.envs.deliverybench.thinking import ThinkTime
-from agentspec.envs.deliverybench.view import OfferCards, describe, state_hash
-from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.envs.deliverybench.city.generate import city_of
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe, state_hash
+from agentspec.envs.deliverybench.view.menu import Option, options
+from agentspec.envs.deliverybench.view.observation import around, compact_text, full_text, instruction
+from agentspec.envs.deliverybench.world.engine import Outcome, World
+from agentspec.envs.deliverybench.world.events import Progress, events_since
+from agentspec.envs.deliverybench.world.rules import Rules, rules_named
+from agentspec.envs.deliverybench.world.thinking import ThinkTime
 from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema
 
@@ -44,11 +43,6 @@ SNAPSHOT_VERSION = 1
 
 Point = tuple[float, float]
 Observation = dict[str, Any]
-
-
-def city_of(map: str | Path | None = None, size: str = "small", city_seed: int = 0) -> City:
-    """The city an environment with these arguments runs in: the folder `map` if given, else a generated city."""
-    return load_city(map) if map is not None else generate(size, city_seed)
 
 
 class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
@@ -83,6 +77,10 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             Metric("deliveries", summary="orders delivered"),
         ),
         "typical_return": 50.0,
+    }
+    experts: ClassVar[dict[str, str]] = {
+        "rule_based": "agentspec.envs.deliverybench.expert.scripted:expert",
+        "random": "agentspec.envs.deliverybench.expert.scripted:luck",
     }
 
     def __init__(
@@ -124,7 +122,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         text = spaces.Text(max_length=MAX_TEXT, min_length=1, charset=CHARSET)
         shown: dict[str, spaces.Space[Any]] = {"text": text}
         if images:
-            from agentspec.envs.deliverybench.render import HEIGHT, WIDTH
+            from agentspec.envs.deliverybench.view.render import HEIGHT, WIDTH
 
             shown["image"] = spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
         self.observation_space = spaces.Dict(shown)
@@ -319,7 +317,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         return info
 
     def _picture(self) -> npt.NDArray[np.uint8]:
-        from agentspec.envs.deliverybench.render import render
+        from agentspec.envs.deliverybench.view.render import render
 
         return render(self.world, [(str(mode), (float(x), float(y))) for mode, x, y in self._track])
 

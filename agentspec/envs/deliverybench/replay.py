@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.deliverybench.bag import Item
-from agentspec.envs.deliverybench.citymap import load_city
-from agentspec.envs.deliverybench.rules import RULE_SETS
-from agentspec.envs.deliverybench.settlement import Settlement
-from agentspec.envs.deliverybench.state import PARKED, State
-from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.envs.deliverybench.city.citymap import load_city
+from agentspec.envs.deliverybench.world.bag import Item
+from agentspec.envs.deliverybench.world.engine import Outcome, World
+from agentspec.envs.deliverybench.world.rules import RULE_SETS
+from agentspec.envs.deliverybench.world.settlement import Settlement
+from agentspec.envs.deliverybench.world.state import PARKED, State
 
 TIME, PLACE, LEVEL, MONEY, HEAT, FINE = 0.11, 0.02, 0.01, 0.01, 0.05, 1e-3
 """Tolerances: seconds, metres, percent, dollars, deg C, and everything without a physical unit (odour, scores)."""

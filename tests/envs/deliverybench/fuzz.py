@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import random
 
-from agentspec.envs.deliverybench.citymap import City
-from agentspec.envs.deliverybench.state import State
-from agentspec.envs.deliverybench.world import HANDLERS
+from agentspec.envs.deliverybench.city.citymap import City
+from agentspec.envs.deliverybench.world.engine import HANDLERS
+from agentspec.envs.deliverybench.world.state import State
 
 HOSTILE = [
     "", " ", "()", "NAN", "nan", "inf", "-inf", "1e308", "1e999", "-1e999", "1e999m", "9" * 400, "0x10", "1_0", "0",

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.deliverybench.citymap import City
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.orders import Point
-from agentspec.envs.deliverybench.rules import Rules
-from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.envs.deliverybench.city.citymap import City
+from agentspec.envs.deliverybench.city.generate import generate
+from agentspec.envs.deliverybench.world.engine import Outcome, World
+from agentspec.envs.deliverybench.world.orders import Point
+from agentspec.envs.deliverybench.world.rules import Rules
 
 REFERENCE = Path(__file__).resolve().parents[3] / ".." / "shared" / "deliverybench"
 needs_reference = pytest.mark.skipif(

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agentspec.envs.deliverybench.bag import HEAT, ICE, Bag, Item
-from agentspec.envs.deliverybench.food import MENU
-from agentspec.envs.deliverybench.grammar import Refused
-from agentspec.envs.deliverybench.packing import place
-from agentspec.envs.deliverybench.rules import ORIGINAL
-from agentspec.envs.deliverybench.state import OrderState
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.world.bag import HEAT, ICE, Bag, Item
+from agentspec.envs.deliverybench.world.engine import World
+from agentspec.envs.deliverybench.world.food import MENU
+from agentspec.envs.deliverybench.world.grammar import Refused
+from agentspec.envs.deliverybench.world.packing import place
+from agentspec.envs.deliverybench.world.rules import ORIGINAL
+from agentspec.envs.deliverybench.world.state import OrderState
 from tests.envs.deliverybench.helpers import collect, do, refuse, world
 
 FOODS = {food.name: food for food in MENU}

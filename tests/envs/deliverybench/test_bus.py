@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from agentspec.envs.deliverybench.bus import BusTimetable, first_tick
-from agentspec.envs.deliverybench.citymap import load_city
-from agentspec.envs.deliverybench.rules import FAIR, ORIGINAL
+from agentspec.envs.deliverybench.city.citymap import load_city
+from agentspec.envs.deliverybench.world.bus import BusTimetable, first_tick
+from agentspec.envs.deliverybench.world.rules import FAIR, ORIGINAL
 from tests.envs.deliverybench.helpers import REFERENCE, do, ledger_holds, needs_reference, refuse, tiny, world
 
 NAMES = ("bus_station 1", "bus_station 2")

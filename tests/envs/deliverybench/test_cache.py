@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.deliverybench import cache, citymap
-from agentspec.envs.deliverybench.citymap import City, load_city
-from agentspec.envs.deliverybench.generate import write_city
+from agentspec.envs.deliverybench.city import cache, citymap
+from agentspec.envs.deliverybench.city.citymap import City, load_city
+from agentspec.envs.deliverybench.city.generate import write_city
 
 
 @pytest.fixture
@@ -86,7 +86,8 @@ def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_many_processes_at_once(folder: Path) -> None:
-    code = f"from agentspec.envs.deliverybench.citymap import load_city; print(len(load_city({str(folder)!r}).pois))"
+    module = "agentspec.envs.deliverybench.city.citymap"
+    code = f"from {module} import load_city; print(len(load_city({str(folder)!r}).pois))"
     running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) for _ in range(3)]
     answers = {process.communicate(timeout=120)[0].strip() for process in running}
     assert answers == {str(len(fresh(folder).pois))}

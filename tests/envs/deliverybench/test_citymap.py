@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.deliverybench.citymap import City, MapError, build_city, load_city
-from agentspec.envs.deliverybench.compile import ordinal
-from agentspec.envs.deliverybench.geometry import box_exit, orientation, project, quarter_turn
+from agentspec.envs.deliverybench.city.citymap import City, MapError, build_city, load_city
+from agentspec.envs.deliverybench.city.compile import ordinal
+from agentspec.envs.deliverybench.city.geometry import box_exit, orientation, project, quarter_turn
 
 REFERENCE = Path(__file__).resolve().parents[3] / ".." / "shared" / "deliverybench"
 CITIES = [

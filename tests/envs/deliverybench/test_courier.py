@@ -8,11 +8,13 @@ from statistics import mean
 
 import pytest
 
-from agentspec.envs.deliverybench import errands
-from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier, Style
+from agentspec.envs.deliverybench.city.generate import generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.errands import Upkeep
-from agentspec.envs.deliverybench.planning import DROPOFF, PICKUP, Job, Planner, Stop, payment
+from agentspec.envs.deliverybench.expert import errands
+from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier, Style
+from agentspec.envs.deliverybench.expert.errands import Upkeep
+from agentspec.envs.deliverybench.expert.planning import DROPOFF, PICKUP, Job, Planner, Stop, payment
+from agentspec.envs.experts import NoPlayer, player, roles
 from agentspec.episode import Job as EpisodeJob
 from agentspec.episode import Runner
 from agentspec.spec import AgentSpec
@@ -155,6 +157,14 @@ def test_as_reasoners_without_a_model(style: str, options: dict) -> None:
     assert first.status == "completed", first.error
     assert [t.action_text for t in first.transitions] == [t.action_text for t in again.transitions]
     assert first.metrics["llm_calls"] == 0 and all(t.decision.valid for t in first.transitions)
+
+
+def test_the_expert_is_asked_of_the_environment() -> None:
+    assert roles("agentspec/DeliveryBench-v0") == DeliveryBenchEnv.experts and roles("CartPole-v1") == {}
+    mine = player("agentspec/DeliveryBench-v0", "rule_based", {"size": "tiny", "city_seed": 3}, random.Random(0))
+    assert isinstance(mine, RuleBasedCourier) and mine.city is generate("tiny", 3)
+    with pytest.raises(NoPlayer, match="CartPole-v1 has no player 'rule_based'"):
+        player("CartPole-v1", "rule_based", {}, random.Random(0))
 
 
 def test_bagging_pays_under_fair_rules() -> None:

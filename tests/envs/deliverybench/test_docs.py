@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from agentspec.envs.deliverybench.city.generate import SPLITS, write_city
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.generate import SPLITS, write_city
-from agentspec.envs.deliverybench.rules import FAIR, ORIGINAL, quirk_table
+from agentspec.envs.deliverybench.world.rules import FAIR, ORIGINAL, quirk_table
 from benchmarks import city_statistics, deliverybench
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "deliverybench.md"

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import agentspec.envs
-from agentspec.envs.deliverybench.courier import RandomCourier, RuleBasedCourier
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
+from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
 from agentspec.types import ActionSchema
 from tests.envs.deliverybench.fuzz import hostile_text
 

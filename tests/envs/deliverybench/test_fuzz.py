@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agentspec.envs.deliverybench.world import Outcome, World
+from agentspec.envs.deliverybench.world.engine import Outcome, World
 from tests.envs.deliverybench.fuzz import hostile_text, sensible_text
 from tests.envs.deliverybench.helpers import ledger_holds, tiny, world
 

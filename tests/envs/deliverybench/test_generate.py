@@ -12,9 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agentspec.envs import deliverybench
-from agentspec.envs.deliverybench.cities import main
-from agentspec.envs.deliverybench.citymap import City, load_city
-from agentspec.envs.deliverybench.generate import FRONT_CM, PLANS, SPLITS, documents, generate, split_of, write_city
+from agentspec.envs.deliverybench.city.__main__ import main
+from agentspec.envs.deliverybench.city.citymap import City, load_city
+from agentspec.envs.deliverybench.city.generate import (
+    FRONT_CM,
+    PLANS,
+    SPLITS,
+    documents,
+    generate,
+    split_of,
+    write_city,
+)
 
 KINDS = ("restaurant", "store", "rest_area", "hospital", "car_rental", "charging_station", "bus_station", "building")
 

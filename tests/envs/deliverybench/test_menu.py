@@ -6,12 +6,12 @@ import random
 
 import pytest
 
-from agentspec.envs.deliverybench import calls
+from agentspec.envs.deliverybench.city.generate import generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.menu import MAX_CHOICES, MAX_ORDERS, best_offers, options
-from agentspec.envs.deliverybench.view import OfferCards, describe
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.view import calls
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe
+from agentspec.envs.deliverybench.view.menu import MAX_CHOICES, MAX_ORDERS, best_offers, options
+from agentspec.envs.deliverybench.world.engine import World
 
 
 def texts(world: World) -> list[str]:

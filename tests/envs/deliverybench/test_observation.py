@@ -6,12 +6,12 @@ import json
 
 import pytest
 
+from agentspec.envs.deliverybench.city.generate import generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.observation import around, compact_text, full_text, instruction, surroundings
-from agentspec.envs.deliverybench.rules import rules_named
-from agentspec.envs.deliverybench.view import OfferCards, describe
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe
+from agentspec.envs.deliverybench.view.observation import around, compact_text, full_text, instruction, surroundings
+from agentspec.envs.deliverybench.world.engine import World
+from agentspec.envs.deliverybench.world.rules import rules_named
 
 
 def fresh(**options) -> tuple[World, OfferCards]:
@@ -141,7 +141,7 @@ def test_late_orders_and_charging_are_shown() -> None:
 
 
 def test_compact_text_stays_short_throughout_an_episode() -> None:
-    from agentspec.envs.deliverybench.courier import RandomCourier
+    from agentspec.envs.deliverybench.expert.courier import RandomCourier
 
     env = DeliveryBenchEnv(size="medium", observation="compact", action_mode="menu", max_steps=80)
     observation, info = env.reset(seed=1)

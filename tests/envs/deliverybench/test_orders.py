@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.deliverybench.citymap import load_city
-from agentspec.envs.deliverybench.food import MENU
-from agentspec.envs.deliverybench.notes import METHODS, NOTES
-from agentspec.envs.deliverybench.orders import OrderBook, pick_scores
-from agentspec.envs.deliverybench.rules import ORIGINAL
+from agentspec.envs.deliverybench.city.citymap import load_city
+from agentspec.envs.deliverybench.world.food import MENU
+from agentspec.envs.deliverybench.world.notes import METHODS, NOTES
+from agentspec.envs.deliverybench.world.orders import OrderBook, pick_scores
+from agentspec.envs.deliverybench.world.rules import ORIGINAL
 from tests.envs.deliverybench.helpers import REFERENCE, do, needs_reference, refuse, stand, tiny, world
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.render import HEIGHT, MAP, SCALE, WAYS, WIDTH, Frame, render
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.city.generate import generate
+from agentspec.envs.deliverybench.view.render import HEIGHT, MAP, SCALE, WAYS, WIDTH, Frame, render
+from agentspec.envs.deliverybench.world.engine import World
 
 
 def pixel(picture: np.ndarray, world: World, point: tuple[float, float]) -> tuple[int, ...]:

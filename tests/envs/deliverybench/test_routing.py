@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.deliverybench.citymap import City, build_city, load_city
-from agentspec.envs.deliverybench.generate import generate
-from agentspec.envs.deliverybench.geometry import polyline_length
-from agentspec.envs.deliverybench.graph import Edge, Graph, all_pairs, shortest_paths
-from agentspec.envs.deliverybench.routing import Network
+from agentspec.envs.deliverybench.city.citymap import City, build_city, load_city
+from agentspec.envs.deliverybench.city.generate import generate
+from agentspec.envs.deliverybench.city.geometry import polyline_length
+from agentspec.envs.deliverybench.city.graph import Edge, Graph, all_pairs, shortest_paths
+from agentspec.envs.deliverybench.city.routing import Network
 from tests.envs.deliverybench.test_citymap import CITIES, REFERENCE, compiled, needs_reference, one_road
 
 
@@ -134,7 +134,7 @@ def test_routes_are_shortest_and_start_and_end_right(seed: int) -> None:
 
 
 def test_tables_and_searches_agree(tmp_path: Path) -> None:
-    from agentspec.envs.deliverybench.generate import write_city
+    from agentspec.envs.deliverybench.city.generate import write_city
 
     searched, tabled = generate("small", 3), load_city(write_city(tmp_path / "small-3", "small", 3))
     assert tabled.router.walk.table is not None and searched.router.walk.table is None

@@ -9,11 +9,11 @@ from itertools import pairwise
 
 import pytest
 
-from agentspec.envs.deliverybench.bag import Item
-from agentspec.envs.deliverybench.food import COLD, HOT, MENU
-from agentspec.envs.deliverybench.packing import suggestion
-from agentspec.envs.deliverybench.rules import FAIR, ORIGINAL, quirk_table, quirks, rules_named
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.world.bag import Item
+from agentspec.envs.deliverybench.world.engine import World
+from agentspec.envs.deliverybench.world.food import COLD, HOT, MENU
+from agentspec.envs.deliverybench.world.packing import suggestion
+from agentspec.envs.deliverybench.world.rules import FAIR, ORIGINAL, quirk_table, quirks, rules_named
 from tests.envs.deliverybench.helpers import (
     REFERENCE,
     collect,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from agentspec.envs.deliverybench.bag import Item
-from agentspec.envs.deliverybench.food import MENU, toward_ambient
-from agentspec.envs.deliverybench.rules import ORIGINAL
-from agentspec.envs.deliverybench.settlement import Settlement, settle, star
+from agentspec.envs.deliverybench.world.bag import Item
+from agentspec.envs.deliverybench.world.food import MENU, toward_ambient
+from agentspec.envs.deliverybench.world.rules import ORIGINAL
+from agentspec.envs.deliverybench.world.settlement import Settlement, settle, star
 
 MENU_BY_NAME = {food.name: food for food in MENU}
 

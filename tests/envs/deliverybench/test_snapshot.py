@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from agentspec.envs.deliverybench.world import World
+from agentspec.envs.deliverybench.world.engine import World
 from tests.envs.deliverybench.fuzz import hostile_text, sensible_text
 from tests.envs.deliverybench.helpers import collect, do, tiny, world
 

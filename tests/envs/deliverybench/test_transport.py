@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agentspec.envs.deliverybench.transport import Follower, heading, sent, ticks_until_empty, waypoints_of
+from agentspec.envs.deliverybench.world.transport import Follower, heading, sent, ticks_until_empty, waypoints_of
 from tests.envs.deliverybench.helpers import do, metres, off, refuse, stand, tiny, world
 
 Point = tuple[float, float]

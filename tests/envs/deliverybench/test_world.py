@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agentspec.envs.deliverybench.grammar import schema_for
-from agentspec.envs.deliverybench.rules import FAIR, ORIGINAL
-from agentspec.envs.deliverybench.world import HANDLERS, World
+from agentspec.envs.deliverybench.world.engine import HANDLERS, World
+from agentspec.envs.deliverybench.world.grammar import schema_for
+from agentspec.envs.deliverybench.world.rules import FAIR, ORIGINAL
 from agentspec.types import Action
 from tests.envs.deliverybench.fuzz import sensible_text
 from tests.envs.deliverybench.helpers import collect, do, ledger_holds, metres, refuse, stand, tiny, world

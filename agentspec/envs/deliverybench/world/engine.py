@@ -1,0 +1,189 @@
+"""The world: one courier, one shift, one action after another.
+
+`World.step` takes the text of an action and returns an `Outcome`; no text makes it raise. Simulated time jumps from
+event to event (see `clock`), so a step costs the same whether it takes a second or half an hour. `snapshot` and
+`restore` are exact, so a search can try actions and go back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from agentspec.actions import parse_action
+from agentspec.envs.deliverybench.world import moving, services, vehicles, work
+from agentspec.envs.deliverybench.world.clock import ShiftOver, end_episode, pass_time
+from agentspec.envs.deliverybench.world.grammar import Refused
+from agentspec.envs.deliverybench.world.recorder import evaluate, report
+from agentspec.envs.deliverybench.world.settlement import Settlement
+from agentspec.envs.deliverybench.world.shift import Shift
+from agentspec.envs.deliverybench.world.snapshot import dump, load
+from agentspec.types import Action, ActionError
+
+RETRIES = 5
+
+Handler = Callable[[Shift, Action], str]
+
+HANDLERS: dict[str, Handler] = {
+    "VIEW_ORDERS": work.view_orders,
+    "ACCEPT_ORDER": work.accept_order,
+    "MOVE": moving.move,
+    "PICKUP": work.pickup,
+    "PLACE_FOOD_IN_BAG": work.place_food_in_bag,
+    "VIEW_BAG": work.view_bag,
+    "DROP_OFF": work.drop_off,
+    "CHARGE": vehicles.charge,
+    "WAIT": services.wait,
+    "REST": services.rest,
+    "BUY": services.buy,
+    "USE_ENERGY_DRINK": services.use_energy_drink,
+    "USE_BATTERY_PACK": vehicles.use_battery_pack,
+    "USE_ICE_PACK": services.use_ice_pack,
+    "USE_HEAT_PACK": services.use_heat_pack,
+    "SWITCH": vehicles.switch,
+    "RENT_CAR": vehicles.rent_car,
+    "RETURN_CAR": vehicles.return_car,
+    "BOARD_BUS": vehicles.board_bus,
+    "VIEW_BUS_SCHEDULE": vehicles.view_bus_schedule,
+    "TURN_AROUND": moving.turn_around,
+    "STEP_FORWARD": moving.step_forward,
+    "SAY": services.say,
+    "VIEW_HELP_BOARD": services.view_help_board,
+    "POST_HELP": services.post_help,
+    "ACCEPT_HELP": services.no_helper,
+    "EDIT_HELP": services.no_helper,
+    "PLACE_TEMP_BOX": services.no_helper,
+    "TAKE_FROM_TEMP_BOX": services.no_helper,
+    "REPORT_HELP_FINISHED": services.no_helper,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one step did.
+
+    Attributes:
+        ok: success; None when the episode ended during the action, which then has no result.
+        code: own code of the failure, "" on success.
+        message: what happened, for the agent.
+        seconds: simulated time that passed.
+        ended, reason: whether the episode is over, and why ("shift" or "calls").
+        settlements: orders delivered in this step.
+        action: the parsed action, or the parse error.
+    """
+
+    ok: bool | None
+    code: str
+    message: str
+    seconds: float
+    ended: bool
+    reason: str
+    settlements: tuple[Settlement, ...]
+    action: Action | ActionError
+
+
+class World(Shift):
+    """One episode of the delivery world: a `Shift` (see there for the arguments) that takes actions as texts."""
+
+    # -- one step ----------------------------------------------------------------------------------------------
+
+    def step(self, text: str | Action, thought: float = 0.0) -> Outcome:
+        """Carry out one action, given as text (or already parsed). Never raises, whatever the text.
+
+        ``thought`` seconds of deliberation pass first. After the end of the episode nothing happens any more (code
+        ENDED).
+        """
+        state = self.state
+        action = text if isinstance(text, Action) else parse_action(text, self.schema)
+        start, delivered = state.tick, len(state.settlements)
+        if state.ended:
+            return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
+        state.calls += 1
+        if thought > 0.0:
+            try:
+                pass_time(self, state.tick + math.ceil(thought * self.rules.ticks_per_second - 1e-6))
+            except ShiftOver:
+                message = "the shift ended while you were thinking"
+                return self._outcome(None, "", message, start, delivered, action)
+        last = self.max_calls is not None and state.calls >= self.max_calls
+        if last and self.rules.last_call_is_cut:
+            self.last_tick = min(self.shift_ticks, state.tick + 1)
+        if isinstance(action, ActionError):
+            outcome = self._unread(action, action.code, action.message, start)
+        else:
+            outcome = self._perform(action, start, delivered)
+        if last and not state.ended:
+            end_episode(self, "calls")
+            outcome = self._outcome(outcome.ok, outcome.code, outcome.message, start, delivered, action)
+        return outcome
+
+    def _perform(self, action: Action, start: int, delivered: int) -> Outcome:
+        state = self.state
+        kind = action.name
+        handler = HANDLERS.get(kind)
+        if handler is None:
+            return self._unread(action, "PARSE_UNKNOWN", f"there is no action {kind}", start)
+        try:
+            summary = handler(self, action)
+        except ShiftOver:
+            self.recorder.attempts[kind] += 1
+            return self._outcome(None, "", "the shift ended", start, delivered, action)
+        except Refused as refusal:
+            if refusal.unread:
+                return self._unread(action, refusal.code, refusal.message, start)
+            state.parse_errors = 0
+            self.recorder.attempts[kind] += 1
+            if not (refusal.silent and self.rules.stale_error):
+                state.error = f"tried {action.text or kind} but failed: {refusal.message}"
+            return self._outcome(False, refusal.code, refusal.message, start, delivered, action)
+        state.parse_errors = 0
+        self.recorder.attempts[kind] += 1
+        self.recorder.successes[kind] += 1
+        self.remember(summary)
+        return self._outcome(True, "", summary, start, delivered, action)
+
+    def _unread(self, action: Action | ActionError, code: str, message: str, start: int) -> Outcome:
+        """An answer that is no action costs a call but no time."""
+        state = self.state
+        self.recorder.parse_failures += 1
+        state.parse_errors += 1
+        state.error = message
+        if state.parse_errors > RETRIES and self.rules.views_after_parse_errors:
+            state.parse_errors = 0
+            self.recorder.attempts["VIEW_ORDERS"] += 1
+            self.recorder.successes["VIEW_ORDERS"] += 1
+            self.remember(work.view_orders(self, Action("VIEW_ORDERS")))
+        return self._outcome(False, code, message, start, len(state.settlements), action)
+
+    def _outcome(
+        self, ok: bool | None, code: str, message: str, start: int, delivered: int, action: Action | ActionError
+    ) -> Outcome:
+        state = self.state
+        seconds = (state.tick - start) / self.rules.ticks_per_second
+        settled = tuple(state.settlements[delivered:])
+        return Outcome(ok, code, message, seconds, state.ended, state.reason, settled, action)
+
+    def summary(self) -> dict[str, Any]:
+        """Run report and evaluation figures so far (JSON values), with city, rule set and seed they belong to."""
+        result = report(self.look(), self.recorder, self.shift_hours, self.rules.initial_balance)
+        result["meta"] |= {"city": self.city.name, "rules": self.rules.name, "seed": self.seed}
+        return result
+
+    def evaluation(self) -> dict[str, float | None]:
+        """The evaluation figures alone (cheap)."""
+        return evaluate(self.state, self.recorder, self.shift_hours, self.rules.initial_balance)
+
+    def snapshot(self) -> bytes:
+        """The exact state as bytes, for `restore` into a world of the same city, rules and seed."""
+        return dump(self.state, self.recorder, self._identity)
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`.
+
+        Raises:
+            ValueError: the bytes are no snapshot of such a world.
+        """
+        self.state, self.recorder = load(blob, self.rules, self.book, self._identity)
+        self.last_tick = self.shift_ticks

@@ -1,0 +1,71 @@
+"""Scripted players: what an environment offers as its expert, and as its player of random sensible actions.
+
+An environment names them in the class attribute `experts`, role -> "module:factory":
+
+    class MyWorld(gymnasium.Env):
+        experts = {"rule_based": "my_package.my_world.expert:expert"}
+
+A factory is called with the task's environment options and a generator, `factory(options, rng, **parameters)`, and
+returns a `Player`. The reasoners `rule_based` and `random` play whatever the environment of their task names here.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any, Protocol
+
+Factory = Callable[..., "Player"]
+
+
+class Player(Protocol):
+    """Plays by rules, without a model."""
+
+    def act(self, info: Mapping[str, Any]) -> str:
+        """The next action as text, from `info["state"]` and `info["action_schema"]` of reset or step."""
+        ...
+
+    def snapshot(self) -> bytes:
+        """What it remembers, for `restore`."""
+        ...
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`."""
+        ...
+
+
+class NoPlayer(ValueError):  # noqa: N818 - read as a sentence in the message of a run
+    """An environment that has no player of this role."""
+
+
+def roles(env_id: str) -> dict[str, str]:
+    """Role -> "module:factory", as the class of a Gymnasium id declares them; empty where it declares none."""
+    import gymnasium
+
+    if ":" in env_id:
+        import_module(env_id.partition(":")[0])
+        env_id = env_id.partition(":")[2]
+    entry = gymnasium.spec(env_id).entry_point
+    if isinstance(entry, str):
+        module, _, name = entry.partition(":")
+        entry = getattr(import_module(module), name)
+    return dict(getattr(entry, "experts", {}))
+
+
+def player(env_id: str, role: str, options: Mapping[str, Any], rng: random.Random, **parameters: Any) -> Player:
+    """The player of `role` for one episode of the environment `env_id` made with `options`.
+
+    Raises:
+        NoPlayer: the environment declares none of this role.
+        TypeError: the player does not take one of the parameters.
+    """
+    declared = roles(env_id)
+    if role not in declared:
+        raise NoPlayer(f"{env_id} has no player {role!r} (it has: {', '.join(declared) or 'none'}); choose a model")
+    module, _, name = declared[role].partition(":")
+    factory: Factory = getattr(import_module(module), name)
+    return factory(options, rng, **parameters)
+
+
+__all__ = ["NoPlayer", "Player", "player", "roles"]

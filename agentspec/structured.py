@@ -1,0 +1,181 @@
+"""Typed answers: JSON out of whatever a model wrote around it, checked against a schema.
+
+A schema is a dataclass, a mapping of field names to types, or a type such as `list[str]`. Models wrap JSON into prose,
+fences and reasoning blocks, so every JSON value of the text is tried, outermost first, and the first one that fits the
+schema is the answer. Nothing is converted silently except whole numbers where a float is asked for.
+
+    parse = json_of({"keep": bool, "notes": list[str]})
+    parse('Sure. ```json\\n{"keep": true, "notes": ["a"]}\\n```')   # {'keep': True, 'notes': ['a']}
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+_THINKING = re.compile(r"<(think|thinking|reasoning)>.*?(?:</\1>|\Z)", re.DOTALL | re.IGNORECASE)
+_STARTS = re.compile(r"[\[{]")
+_MOST_STARTS = 64  # values tried in one text; a longer search only serves texts that are no answer
+_NAMES = {str: "string", int: "whole number", float: "number", bool: "true or false", dict: "object", list: "list"}
+
+
+class ParseError(ValueError):
+    """A text that is no answer; the message says what was found and what is expected, in words for the model."""
+
+
+@dataclass(frozen=True)
+class Parser(Generic[T]):
+    """How to read an answer, what to call a good one, and how often to ask again.
+
+    Args:
+        read: text -> value; raises `ParseError`.
+        expected: what a good answer looks like, for the request to repair a bad one.
+        repairs: further calls that may be made for an answer that cannot be read: 0 or 1.
+    """
+
+    read: Callable[[str], T]
+    expected: str
+    repairs: int = 1
+
+    def __call__(self, text: str) -> T:
+        return self.read(text)
+
+
+def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
+    """A parser of JSON answers.
+
+    Args:
+        schema: a dataclass (the value is an instance), a mapping of field name to type (the value is a dict), or a
+            type. Types are `str`, `int`, `float`, `bool`, `list[X]`, `tuple[X, ...]`, `dict[str, X]`, `Literal[...]`,
+            `X | None`, `Any`, dataclasses and mappings, nested as deep as wanted. Fields that the schema does not
+            have are ignored; a dataclass's defaults fill in fields that are missing.
+        repairs: see `Parser`.
+    """
+
+    def read(text: str) -> Any:
+        problem = "there is no JSON in it"
+        for value in _values(without_thinking(text)):
+            try:
+                return check(value, schema)
+            except ParseError as error:
+                if problem.startswith("there is no JSON"):
+                    problem = str(error)
+        raise ParseError(problem)
+
+    return Parser(read, f"JSON of the form {describe(schema)}", repairs)
+
+
+def without_thinking(text: str) -> str:
+    """The text without its reasoning blocks, closed or cut off."""
+    return _THINKING.sub("", text).strip()
+
+
+def _values(text: str) -> Iterator[Any]:
+    """The JSON objects and lists of a text, outermost first; what lies inside a value is no value of its own."""
+    decoder = json.JSONDecoder()
+    end = 0
+    for number, match in enumerate(_STARTS.finditer(text)):
+        if number >= _MOST_STARTS:
+            return
+        if match.start() < end:
+            continue
+        try:
+            value, end = decoder.raw_decode(text, match.start())
+        except (ValueError, RecursionError):
+            continue
+        yield value
+
+
+def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: PLR0911  # one line per type
+    """The JSON value as the schema has it.
+
+    Raises:
+        ParseError: naming the field, what is expected and what was found.
+    """
+    if isinstance(schema, Mapping):
+        return _check_fields(value, schema, {}, where)
+    if dataclasses.is_dataclass(schema) and isinstance(schema, type):
+        hints = get_type_hints(schema)
+        defaults = {f.name: f for f in dataclasses.fields(schema) if _has_default(f)}
+        fields = {f.name: hints[f.name] for f in dataclasses.fields(schema) if f.init}
+        return schema(**_check_fields(value, fields, defaults, where))
+    origin, arguments = get_origin(schema), get_args(schema)
+    if schema is Any:
+        return value
+    if origin in (Union, types.UnionType):
+        return _check_union(value, arguments, where)
+    if origin is Literal:
+        if value in arguments and type(value) in {type(a) for a in arguments}:
+            return value
+    elif origin in (list, tuple, Sequence) and isinstance(value, list):
+        items = [check(v, arguments[0], f"item {i + 1} of {where}") for i, v in enumerate(value)]
+        return tuple(items) if origin is tuple else items
+    elif origin in (dict, Mapping) and isinstance(value, dict):
+        return {k: check(v, arguments[1], f"{k!r} of {where}") for k, v in value.items()}
+    elif schema is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif schema in (None, type(None)):
+        if value is None:
+            return None
+    elif isinstance(schema, type) and isinstance(value, schema) and not (schema is int and isinstance(value, bool)):
+        return value
+    raise ParseError(f"{where} must be {describe(schema)}, not {_shown(value)}")
+
+
+def _check_union(value: Any, alternatives: Sequence[Any], where: str) -> Any:
+    for alternative in alternatives:
+        try:
+            return check(value, alternative, where)
+        except ParseError:
+            continue
+    raise ParseError(f"{where} must be {' or '.join(map(describe, alternatives))}, not {_shown(value)}")
+
+
+def _check_fields(value: Any, fields: Mapping[str, Any], defaults: Mapping[str, Any], where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ParseError(f"{where} must be {describe(dict(fields))}, not {_shown(value)}")
+    missing = [name for name in fields if name not in value and name not in defaults]
+    if missing:
+        raise ParseError(f"{where} lacks {', '.join(map(repr, missing))}")
+    return {name: check(value[name], kind, repr(name)) for name, kind in fields.items() if name in value}
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+
+
+def describe(schema: Any) -> str:  # noqa: PLR0911  # one line per type
+    """The schema in words for a model.
+
+    >>> describe({"keep": bool, "notes": list[str]})
+    '{"keep": true or false, "notes": [string, ...]}'
+    """
+    if dataclasses.is_dataclass(schema) and isinstance(schema, type):
+        hints = get_type_hints(schema)
+        schema = {f.name: hints[f.name] for f in dataclasses.fields(schema) if f.init}
+    if isinstance(schema, Mapping):
+        return "{" + ", ".join(f'"{name}": {describe(kind)}' for name, kind in schema.items()) + "}"
+    origin, arguments = get_origin(schema), get_args(schema)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(describe, arguments))
+    if origin is Literal:
+        return " or ".join(json.dumps(a) for a in arguments)
+    if origin in (list, tuple, Sequence):
+        return f"[{describe(arguments[0])}, ...]"
+    if origin in (dict, Mapping):
+        return f"{{name: {describe(arguments[1])}, ...}}"
+    if schema in (None, type(None)):
+        return "null"
+    return _NAMES.get(schema, "any value")
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."

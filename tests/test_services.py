@@ -1,0 +1,159 @@
+"""What a module is given: asking for typed answers, time, ids, and what is counted when something goes wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import pytest
+
+from agentspec.context import Context
+from agentspec.llm.base import Request
+from agentspec.llm.recorder import Budget, ModuleLLM, Recorder
+from agentspec.llm.scripted import ScriptedLLM
+from agentspec.services import Answer, Services, StepClock, Time
+from agentspec.structured import ParseError, describe, json_of
+from agentspec.types import Sampling
+
+
+@dataclass(frozen=True)
+class Note:
+    text: str
+    weight: float
+    tags: list[str] = field(default_factory=list)
+
+
+NOTE = json_of(Note)
+
+
+def services(*answers: str, max_context: int = 1_000_000, **budget: Any) -> Services:
+    llm = ScriptedLLM(list(answers), max_context=max_context)
+    sampling = Sampling(stop=("\n",), choices=("GO()", "STOP()"))  # the action's: they must not apply
+    recorder = Recorder(llm, episode="e", seed=0, sampling=sampling, budget=Budget(**budget))
+    return Services(ModuleLLM(recorder, "memory.m"), Context(), StepClock(), random.Random(0))
+
+
+def ask(given: Services, parse: Any = None, max_tokens: int = 200, **more: Any) -> Answer[Any]:
+    return asyncio.run(given.ask("note", "What is worth noting?", max_tokens, parse, **more))
+
+
+def problems(given: Services) -> dict[str, int]:
+    return {problem: n for (_, problem), n in given.llm.recorder.problems.items()}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"text": "hot food", "weight": 2}',
+        'Here it is:\n```json\n{"text": "hot food", "weight": 2.0, "tags": []}\n```\nGood luck!',
+        '<think>{"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2, "more": 1}',
+        'As in {the rules}, [see above]: {"text": "hot food", "weight": 2} and so on {"text": "b", "weight": 1}',
+    ],
+)
+def test_json_is_found_in_what_is_written_around_it(text: str) -> None:
+    assert NOTE(text) == Note("hot food", 2.0)
+
+
+@pytest.mark.parametrize(
+    ("schema", "text", "problem"),
+    [
+        (Note, "Nothing to say.", "there is no JSON in it"),
+        (Note, '{"text": "a"}', "the answer lacks 'weight'"),
+        (Note, '{"text": 3, "weight": 1}', "'text' must be string, not 3"),
+        (Note, '{"text": "a", "weight": true}', "'weight' must be number, not true"),
+        (Note, '{"text": "a", "weight": 1, "tags": ["x", 1]}', "item 2 of 'tags' must be string, not 1"),
+        (Note, '[{"text": "a"}]', "the answer must be"),
+        ({"n": int}, '{"n": 1.5}', "'n' must be whole number"),
+        ({"n": int | None}, '{"n": "x"}', "'n' must be whole number or null"),
+        ({"op": Literal["ADD", "NONE"]}, '{"op": "DROP"}', '\'op\' must be "ADD" or "NONE"'),
+        ({"d": dict[str, int]}, '{"d": {"a": []}}', "'a' of 'd' must be whole number"),
+        (list[Note], "[" * 3000, "there is no JSON in it"),
+    ],
+)
+def test_what_does_not_fit_says_why(schema: Any, text: str, problem: str) -> None:
+    with pytest.raises(ParseError) as caught:
+        json_of(schema)(text)
+    assert problem in str(caught.value)
+
+
+def test_types_are_read_as_the_schema_has_them() -> None:
+    parse = json_of({"a": tuple[int, ...], "b": Any, "c": Literal[1, "x"], "d": dict[str, Note], "e": None | str})
+    value = parse('{"a": [1, 2], "b": {"q": []}, "c": 1, "d": {"k": {"text": "t", "weight": 1}}, "e": null}')
+    assert value == {"a": (1, 2), "b": {"q": []}, "c": 1, "d": {"k": Note("t", 1.0)}, "e": None}
+    assert json_of(list[int])("I count [1, 2, 3].") == [1, 2, 3]
+    assert describe(Note) == '{"text": string, "weight": number, "tags": [string, ...]}'
+
+
+def test_an_answer_is_free_of_the_actions_constraints_and_typed() -> None:
+    given = services('Line one\n{"text": "a", "weight": 1}')
+    answer = ask(given, NOTE)
+    assert answer.value == Note("a", 1.0) and answer.problem == "" and problems(given) == {}
+    (call,) = given.llm.recorder.calls
+    assert call.sampling.stop == () and call.sampling.choices == () and call.tag.path == "memory.m/note"
+
+
+def test_one_repair_with_the_reason() -> None:
+    asked: list[Request] = []
+
+    def script(request: Request) -> str:
+        asked.append(request)
+        return '{"text": "a"}' if request.id == 0 else '{"text": "a", "weight": 1}'
+
+    given = services("x")
+    given.llm.recorder.llm = ScriptedLLM(script)
+    answer = ask(given, NOTE)
+    assert answer.value == Note("a", 1.0) and answer.problem == "" and problems(given) == {"repaired": 1}
+    assert "lacks 'weight'" in asked[1].messages[-1].text and describe(Note) in asked[1].messages[-1].text
+    assert asked[1].messages[-2].text == '{"text": "a"}' and asked[1].tag.branch == "repair"
+
+
+def test_what_cannot_be_repaired_is_a_counted_problem() -> None:
+    given = services("No.")
+    answer = ask(given, NOTE)
+    assert answer.value is None and answer.problem == "malformed" and answer.text == "No."
+    assert len(given.llm.recorder.calls) == 2 and problems(given) == {"unrepaired": 1, "malformed": 1}
+    given = services("No.")
+    assert ask(given, json_of(Note, repairs=0)).problem == "malformed" and len(given.llm.recorder.calls) == 1
+    given = services("seven")
+    assert ask(given, int).problem == "malformed" and len(given.llm.recorder.calls) == 1
+    assert ask(services("7"), int).value == 7
+
+
+def test_credit_does_not_depend_on_whether_it_parsed() -> None:
+    given = services("No.")
+    ask(given, NOTE, credit="executed")
+    assert [c.completions[0].credit for c in given.llm.recorder.calls] == ["executed", "executed"]
+
+
+def test_too_long_is_a_problem_and_no_exception() -> None:
+    given = services('{"text": "a", "weight": 1}', max_context=100)
+    assert ask(given, NOTE).problem == "overflow" and given.llm.recorder.calls == []
+    given = services("a long story")
+    answer = ask(given, max_tokens=6)
+    assert (answer.value, answer.problem) == ("a long", "truncated") and problems(given) == {"truncated": 1}
+    given = services("a long story")
+    assert ask(given, json_of(Note, repairs=0), max_tokens=6).problem == "truncated"
+    given = services("<think>for ever")
+    assert ask(given).value is None and problems(given) == {"malformed": 1}
+
+
+def test_a_budget_that_allows_no_call_is_a_problem() -> None:
+    given = services("No.", calls=1)
+    answer = ask(given, NOTE)  # the repair is not allowed any more
+    assert answer.problem == "malformed" and answer.text == "No."
+    assert ask(given).problem == "budget" and ask(given).call is None
+    assert problems(given) == {"unrepaired": 1, "malformed": 1, "budget": 2}
+
+
+def test_time_and_ids_go_on_over_the_episodes_of_a_run() -> None:
+    clock = StepClock()
+    assert [clock.new_id("memory.a"), clock.new_id("memory.a"), clock.new_id("memory.b")] == [0, 1, 0]
+    clock.step = 5
+    assert clock.time == Time(0, 5, 5)
+    after = StepClock()
+    after.resume(clock.carry())
+    assert after.time == Time(1, 0, 5) and [after.new_id("memory.a"), after.new_id("memory.b")] == [2, 1]
+    clock.new_id("memory.a")  # a fork does not see the other's
+    assert after.new_id("memory.a") == 3

@@ -1,0 +1,263 @@
+"""Credit: from the scored episodes of an update to rows with advantages.
+
+A :class:`CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
+gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
+scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
+became changes nobody's baseline, and all of them share its advantage.
+
+A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
+made after the last step earns nothing in its episode and has no row (:mod:`trainers.sequences`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from agentspec.trajectory import Trajectory
+from rewards import RewardSet, Score
+from trainers.estimators import ESTIMATORS, estimator
+from trainers.sequences import Advantage, Row, TokenSequence, TrainFilter, build_sequences
+
+Gather = Callable[[list[Any]], list[Any]]
+"""List of this rank -> the concatenated lists of all ranks."""
+
+
+@dataclass(frozen=True)
+class ScoredEpisode:
+    """An episode and what it earned; `score` is `None` if it failed."""
+
+    trajectory: Trajectory
+    score: Score | None
+
+    @property
+    def total(self) -> float | None:
+        """The weighted return; `None` if the episode failed."""
+        return None if self.score is None else self.score.total
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What every rank must know of an episode before groups can be formed.
+
+    Args:
+        rewards: per step; `None` if the episode could not be scored.
+        anchors: per step the state its action was taken in, if the estimator needs it.
+        overlong: whether it ended for one of the reasons that make it overlong.
+    """
+
+    rewards: tuple[float, ...] | None
+    anchors: tuple[str, ...] = ()
+    overlong: bool = False
+
+
+@dataclass(frozen=True)
+class Credited:
+    """Rows of this rank with their advantages, and what the logs say about them."""
+
+    rows: list[Row]
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CreditRule:
+    """How episodes are credited.
+
+    Args:
+        group: rollouts per task; episodes come in whole groups.
+        estimator: a name in :data:`~trainers.estimators.ESTIMATORS`.
+        gamma: discount per step, for estimators that need it.
+        gigpo_weight: weight of GiGPO's step advantage.
+        normalize: `token` or `rollout`: whether every trained token weighs alike, or every rollout.
+        overlong: `mask` (no loss, in the baseline), `keep` or `drop` (neither loss nor baseline).
+        overlong_ends: ends that make an episode overlong.
+        skip_zero_variance: leave groups that the estimator gives no signal out of the loss denominator too.
+        train: which completions are trained.
+        rewards: reward name -> weight.
+    """
+
+    group: int
+    estimator: str = "grpo"
+    gamma: float = 1.0
+    gigpo_weight: float = 1.0
+    normalize: str = "token"
+    overlong: str = "mask"
+    overlong_ends: tuple[str, ...] = ("context",)
+    skip_zero_variance: bool = False
+    train: TrainFilter = field(default_factory=TrainFilter)
+    rewards: Mapping[str, float] = field(default_factory=lambda: {"earning_delta": 1.0})
+
+    @classmethod
+    def from_config(cls, config: Any) -> CreditRule:
+        """The rule of a :class:`~trainers.config.ScaffoldConfig`."""
+        return cls.from_manifest({name: getattr(config, name) for name in FIELDS})
+
+    @classmethod
+    def from_manifest(cls, config: Mapping[str, Any]) -> CreditRule:
+        """The rule of a run, from the configuration that its manifest records.
+
+        Raises:
+            ValueError: the record lacks a field that credit depends on.
+        """
+        missing = [name for name in FIELDS if name not in config]
+        if missing:
+            raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
+        rewards = config["rewards"]
+        same = ("estimator", "gamma", "gigpo_weight", "normalize", "overlong", "skip_zero_variance")
+        return cls(
+            group=config["num_generations"],
+            overlong_ends=tuple(config["overlong_ends"]),
+            train=TrainFilter(
+                tuple(config["train_calls"]), tuple(config["train_credits"]), tuple(config["mask_truncated"])
+            ),
+            rewards=RewardSet({rewards: 1.0} if isinstance(rewards, str) else rewards).weights,
+            **{name: config[name] for name in same},
+        )
+
+    def score(self, trajectories: Sequence[Trajectory]) -> list[ScoredEpisode]:
+        """Recorded episodes with their scores."""
+        rewards = RewardSet(self.rewards)
+        return [ScoredEpisode(t, rewards.score(t)) for t in trajectories]
+
+    def outcome(self, episode: ScoredEpisode) -> Outcome:
+        """What groups are formed of."""
+        trajectory = episode.trajectory
+        anchors = "anchors" in estimator(self.estimator).needs
+        return Outcome(
+            None if episode.score is None else episode.score.steps,
+            tuple(t.input.text for t in trajectory.transitions) if anchors else (),
+            is_overlong(trajectory, self.overlong_ends),
+        )
+
+    def advantages(self, outcomes: Sequence[Outcome]) -> list[float | list[float] | None]:
+        """Per rollout its advantage, or one per step; `None` for a rollout that counts nowhere.
+
+        Args:
+            outcomes: whole groups, one after the other.
+
+        Raises:
+            ValueError: no whole groups.
+        """
+        if len(outcomes) % self.group:
+            raise ValueError(f"{len(outcomes)} episodes are no whole groups of {self.group}")
+        spec = estimator(self.estimator)
+        given = {"gamma": self.gamma, "gigpo_weight": self.gigpo_weight}
+        result: list[float | list[float] | None] = [None] * len(outcomes)
+        for start in range(0, len(outcomes), self.group):
+            places = [i for i in range(start, start + self.group) if self._counts(outcomes[i])]
+            rewards = [outcomes[i].rewards or () for i in places]
+            needed = given | {"anchors": [outcomes[i].anchors for i in places]}
+            values: Any = rewards if spec.per_step else [_total(r) for r in rewards]
+            values = spec.function(values, **{name: needed[name] for name in spec.needs})
+            for i, value in zip(places, values, strict=True):
+                result[i] = value
+        return result
+
+    def credit(self, episodes: Sequence[ScoredEpisode], *, rank: int = 0, gather: Gather = list) -> Credited:
+        """Rows of this rank's episodes, with the advantages of whole groups.
+
+        Args:
+            episodes: this rank's; ranks hold equally many, in the order of the global batch (a group may span ranks).
+            gather: returns of all ranks are needed, and their numbers of trained tokens.
+        """
+        outcomes: list[Outcome] = gather([self.outcome(e) for e in episodes])
+        advantages = self.advantages(outcomes)
+        signal = self.signal(advantages)
+        first = rank * len(episodes)
+        rows: list[Row] = []
+        for i, episode in enumerate(episodes):
+            place = first + i
+            advantage = advantages[place]
+            masked = self.overlong == "mask" and outcomes[place].overlong
+            skipped = self.skip_zero_variance and not signal[place // self.group]
+            if advantage is None or masked or skipped:
+                continue
+            sequences = build_sequences(episode.trajectory, self.train)
+            rows += [Row(s, _per_token(s, advantage), i) for s in sequences]
+        if self.normalize == "rollout":
+            rows = per_rollout(rows, gather)
+        return Credited(rows, _metrics(outcomes, signal, rows, len(episodes)))
+
+    def signal(self, advantages: Sequence[float | list[float] | None]) -> list[bool]:
+        """Per group whether its estimator gives anyone an advantage other than 0."""
+        groups = range(0, len(advantages), self.group)
+        return [any(map(_nonzero, advantages[start : start + self.group])) for start in groups]
+
+    def _counts(self, outcome: Outcome) -> bool:
+        return outcome.rewards is not None and not (self.overlong == "drop" and outcome.overlong)
+
+
+FIELDS = (
+    "num_generations",
+    "estimator",
+    "gamma",
+    "gigpo_weight",
+    "normalize",
+    "overlong",
+    "overlong_ends",
+    "skip_zero_variance",
+    "train_calls",
+    "train_credits",
+    "mask_truncated",
+    "rewards",
+)
+"""Fields of a configuration that credit depends on."""
+
+
+def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
+    """Whether the episode ended for a reason in `ends`."""
+    ended = str(trajectory.metrics.get("ended", "environment"))
+    cut = bool(trajectory.transitions) and trajectory.transitions[-1].truncated
+    return ended in ends or ("truncated" in ends and cut)
+
+
+def per_rollout(rows: Sequence[Row], gather: Gather = list) -> list[Row]:
+    """Scale advantages so that every rollout weighs the same, however many tokens its scaffold trained.
+
+    The loss divides by all N trained tokens; a rollout with n of them counts n / N. With the factor N / (R n), R
+    rollouts with something to train, it counts 1 / R: the mean over rollouts of their mean over tokens.
+    """
+    counts: Counter[int] = Counter()
+    for row in rows:
+        counts[row.episode] += row.sequence.trained
+    everywhere: list[int] = gather(list(counts.values()))
+    total, rollouts = sum(everywhere), len(everywhere)
+    return [replace(row, advantage=_times(row.advantage, total / (rollouts * counts[row.episode]))) for row in rows]
+
+
+def _total(rewards: Sequence[float]) -> float:
+    return Score({}, tuple(rewards)).total
+
+
+def _times(advantage: Advantage, factor: float) -> Advantage:
+    return advantage * factor if isinstance(advantage, float) else tuple(a * factor for a in advantage)
+
+
+def _nonzero(advantage: float | list[float] | None) -> bool:
+    return any(advantage) if isinstance(advantage, list) else bool(advantage)
+
+
+def _per_token(sequence: TokenSequence, advantage: float | list[float]) -> Advantage:
+    """The episode's number, or each trained token's step value."""
+    if isinstance(advantage, float):
+        return advantage
+    return tuple(advantage[s] if m else 0.0 for s, m in zip(sequence.steps, sequence.mask, strict=True))
+
+
+def _metrics(
+    outcomes: Sequence[Outcome], signal: Sequence[bool], rows: Sequence[Row], episodes: int
+) -> dict[str, float]:
+    per_episode = Counter(row.episode for row in rows)
+    return {
+        "groups/zero_variance": 1 - sum(signal) / max(1, len(signal)),
+        "rollouts/unscorable": sum(o.rewards is None for o in outcomes) / max(1, len(outcomes)),
+        "rollouts/overlong": sum(o.overlong for o in outcomes) / max(1, len(outcomes)),
+        "rollouts/rows_per_episode": len(rows) / max(1, episodes),
+        "rollouts/trained_tokens": float(sum(row.sequence.trained for row in rows)),
+        "rollouts/multi_row_episodes": sum(n > 1 for n in per_episode.values()) / max(1, episodes),
+    }
+
+
+__all__ = ["ESTIMATORS", "FIELDS", "CreditRule", "Credited", "Outcome", "ScoredEpisode", "is_overlong", "per_rollout"]

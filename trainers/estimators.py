@@ -1,0 +1,207 @@
+"""Estimators: how the returns of a group become advantages. One function and one row of :data:`ESTIMATORS` adds one.
+
+An estimator sees the scorable rollouts of one group and nothing else: no failed rollout, no token, no sequence, so
+that none of these can change a baseline. One *per episode* gets their returns and gives one number each; one *per step*
+gets their rewards per step and gives as many numbers. Plain floats in and out, so that whoever checks a run computes
+the very same numbers without a model in sight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from agentspec.actions import suggest
+from agentspec.registry import SpecError
+
+EPSILON = 1e-4
+"""Added to a deviation before dividing by it, as TRL's synchronous trainer does."""
+
+TOLERANCE = 1e-6
+"""Values whose deviation is at most this are equal up to float noise: they carry no signal."""
+
+Returns = Sequence[float]
+Rewards = Sequence[Sequence[float]]
+Anchors = Sequence[Sequence[Hashable]]
+
+
+@dataclass(frozen=True)
+class EstimatorSpec:
+    """One row of the table.
+
+    Args:
+        name: as in `estimator: NAME`.
+        function: per episode: returns (n,) -> advantages (n,); per step: rewards, ragged (n, steps) -> the same shape.
+        summary: what it does, in one line.
+        per_step: whether it gives one advantage per step.
+        zero_sum: whether the advantages of a group sum to zero (what an audit may expect of an honest run).
+        needs: keyword arguments of `function` that come from the configuration (`gamma`, `gigpo_weight`) or from the
+            episodes (`anchors`: per rollout and step the state in which the action was taken).
+    """
+
+    name: str
+    function: Callable[..., Any]
+    summary: str
+    per_step: bool = False
+    zero_sum: bool = True
+    needs: tuple[str, ...] = ()
+
+
+def grpo(returns: Returns) -> list[float]:
+    """Centred by the group's mean, divided by its sample deviation (Shao et al., 2024; TRL's convention).
+
+    >>> [round(a, 3) for a in grpo([15.0, 10.0, 5.0, 15.0])]
+    [0.783, -0.261, -1.306, 0.783]
+    """
+    return _scaled([_centred(returns)])[0]
+
+
+def centred(returns: Returns) -> list[float]:
+    """Centred by the group's mean only (Dr. GRPO, Liu et al., 2025): no division by the deviation."""
+    return _centred(returns)
+
+
+def rloo(returns: Returns) -> list[float]:
+    """Leave-one-out: each return minus the mean of the *others* (Ahmadian et al., 2024).
+
+    That is the centred return times n / (n - 1); a lone rollout gets 0.
+
+    >>> rloo([1.0, 0.0])
+    [1.0, -1.0]
+    """
+    n = len(returns)
+    return [value * n / (n - 1) for value in _centred(returns)] if n > 1 else [0.0] * n
+
+
+def max_rl(returns: Returns) -> list[float]:
+    """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710).
+
+    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved weighs about
+    1 / p. A group that earned nothing has no signal.
+
+    >>> max_rl([1.0, 0.0, 0.0, 0.0])
+    [3.0, -1.0, -1.0, -1.0]
+
+    Raises:
+        SpecError: a negative return (the method is defined for rates of success).
+    """
+    if any(value < -TOLERANCE for value in returns):
+        raise SpecError(
+            f"estimator 'max_rl' divides by the mean return, a rate of success: expected returns >= 0, got "
+            f"{list(returns)}; choose rewards that are never negative, or another estimator"
+        )
+    mean = math.fsum(returns) / len(returns) if returns else 0.0
+    return [value / mean for value in _centred(returns)] if mean > 0 else [0.0] * len(returns)
+
+
+def discounted(rewards: Sequence[float], gamma: float) -> list[float]:
+    """Discounted reward-to-go of each step.
+
+    >>> discounted([1.0, 0.0, 2.0], 0.5)
+    [1.5, 1.0, 2.0]
+    """
+    togo, running = [0.0] * len(rewards), 0.0
+    for t in range(len(rewards) - 1, -1, -1):
+        running = rewards[t] + gamma * running
+        togo[t] = running
+    return togo
+
+
+def reward_to_go(rewards: Rewards, *, gamma: float = 1.0) -> list[list[float]]:
+    """Discounted reward-to-go, centred per step over the group and scaled by the group's deviation.
+
+    The baseline of step t is the mean over all rollouts; one that has ended earns nothing more, so it counts with 0.
+    The deviation is that of all centred values of the group (sample deviation).
+    """
+    togo = [discounted(r, gamma) for r in rewards]
+    longest = max(map(len, togo), default=0)
+    means = [math.fsum(g[t] if t < len(g) else 0.0 for g in togo) / len(togo) for t in range(longest)]
+    if len(togo) < 2:
+        return [[0.0] * len(g) for g in togo]
+    return _scaled([[v - m for v, m in zip(g, means, strict=False)] for g in togo])
+
+
+def gigpo(rewards: Rewards, *, anchors: Anchors, gamma: float = 1.0, gigpo_weight: float = 1.0) -> list[list[float]]:
+    """Group-in-group (Feng et al., 2025): the episode's advantage plus that of the step among equal states.
+
+    Args:
+        anchors: steps of the group with equal anchors form a step group, in which their rewards-to-go are normalised.
+            A state met once has step advantage 0.
+        gigpo_weight: of the step advantage.
+    """
+    togo = [discounted(r, gamma) for r in rewards]
+    members: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
+    for i, (values, states) in enumerate(zip(togo, anchors, strict=True)):
+        if len(states) != len(values):
+            raise ValueError(f"rollout {i} has {len(values)} steps and {len(states)} anchor states")
+        for t, state in enumerate(states):
+            members[state].append((i, t))
+    result = [[base] * len(r) for base, r in zip(grpo([math.fsum(r) for r in rewards]), rewards, strict=True)]
+    for places in members.values():
+        for (i, t), value in zip(places, grpo([togo[i][t] for i, t in places]), strict=True):
+            result[i][t] += gigpo_weight * value
+    return result
+
+
+ESTIMATORS: dict[str, EstimatorSpec] = {
+    spec.name: spec
+    for spec in (
+        EstimatorSpec("grpo", grpo, "(return - group mean) / sample deviation"),
+        EstimatorSpec("centred", centred, "return - group mean (Dr. GRPO)"),
+        EstimatorSpec("rloo", rloo, "return - mean of the others (leave-one-out)"),
+        EstimatorSpec("max_rl", max_rl, "(return - group mean) / group mean, returns >= 0 (maximum likelihood)"),
+        EstimatorSpec(
+            "reward_to_go",
+            reward_to_go,
+            "reward-to-go of the step, centred per step over the group, / deviation of the group",
+            per_step=True,
+            zero_sum=False,
+            needs=("gamma",),
+        ),
+        EstimatorSpec(
+            "gigpo",
+            gigpo,
+            "`grpo` of the episode + that of the step's reward-to-go among equal states (group in group)",
+            per_step=True,
+            zero_sum=False,
+            needs=("anchors", "gamma", "gigpo_weight"),
+        ),
+    )
+}
+"""Every estimator by name."""
+
+
+def estimator(name: str) -> EstimatorSpec:
+    """The row of ``name``.
+
+    Raises:
+        SpecError: no such estimator.
+    """
+    if name not in ESTIMATORS:
+        raise SpecError(f"unknown estimator {name!r}{suggest(name, ESTIMATORS)}")
+    return ESTIMATORS[name]
+
+
+def _centred(values: Sequence[float]) -> list[float]:
+    """Less their mean; exactly 0 where all are equal up to float noise."""
+    if not values:
+        return []
+    mean = math.fsum(values) / len(values)
+    result = [v - mean for v in values]
+    return result if _deviation(result) > TOLERANCE else [0.0] * len(result)
+
+
+def _scaled(centred: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Divided by the sample deviation of all values; exactly 0 where all are equal up to float noise."""
+    deviation = _deviation([v for values in centred for v in values])
+    if deviation <= TOLERANCE:
+        return [[0.0] * len(values) for values in centred]
+    return [[v / (deviation + EPSILON) for v in values] for values in centred]
+
+
+def _deviation(centred: Sequence[float]) -> float:
+    """Sample deviation of values whose mean is 0; 0 for fewer than two."""
+    return math.sqrt(math.fsum(v * v for v in centred) / (len(centred) - 1)) if len(centred) > 1 else 0.0
