@@ -311,7 +311,7 @@ class NoLLM:
     """The backend of agents without a model: any call is an error that says so."""
 
     name = "none"
-    capabilities: frozenset[str] = frozenset()
+    capabilities: frozenset[str] = frozenset({"images"})  # nobody looks at them: scripted agents act on the state
     max_context = 0
 
     async def generate(self, request: Any) -> Any:

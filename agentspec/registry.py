@@ -139,12 +139,14 @@ register(
     "generic",
     "agentspec.perception.generic:GenericPerception",
     "image, instruction, state and action schema of any environment that keeps the contract",
+    waived={"images": ("images", False)},
 )
 register(
     "perception",
     "deliverybench",
     "agentspec.perception.deliverybench:DeliveryBenchPerception",
     "the four components of DeliveryBench: image, instruction, state, action schema",
+    waived={"images": ("images", False)},
 )
 
 register("memory", "none", "agentspec.memory.none:NoMemory", "remembers nothing")

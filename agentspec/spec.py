@@ -164,7 +164,8 @@ class AgentSpec:
 
     def _needs_of(self, kind: str) -> tuple[str, ...]:
         module: ModuleSpec = getattr(self, kind)
-        return REGISTRY.get(kind, module.name).needs_with(module.params)
+        needs: tuple[str, ...] = REGISTRY.get(kind, module.name).needs_with(module.params)
+        return (*needs, "images") if kind == "perception" and module.params.get("images") else needs
 
     def check(self, capabilities: frozenset[str], who: str) -> None:
         """Refuse a backend that lacks what a module needs.
