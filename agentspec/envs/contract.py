@@ -101,7 +101,7 @@ def check_environment(env: Any, *, seed: int = 0, steps: int = 30) -> None:
 
 def _problems(env: Any, seed: int, steps: int) -> Iterator[str]:
     """Everything that is wrong; an exception of the environment is a problem and ends that check only."""
-    for check in (_declares, _shows, _refuses, _offers, _repeats, _copies, _snapshots, _ends):
+    for check in (_declares, _shows, _refuses, _offers, _repeats, _copies, _snapshots, _deliberates, _ends):
         problems: list[str] = []
         try:
             for problem in check(env, seed, steps):
@@ -255,6 +255,18 @@ def _snapshots(env: Any, seed: int, steps: int) -> Iterator[str]:
         yield "restore(snapshot()) changes the snapshot: not everything that it holds is put back"
     again = _go_on(world, info, 5, random.Random(seed))
     yield from _differences(mine, again, "restored from a snapshot")
+
+
+def _deliberates(env: Any, seed: int, steps: int) -> Iterator[str]:
+    """Where thinking is charged, the charge of each step stands in its report."""
+    deliberate = getattr(getattr(env, "unwrapped", env), "deliberate", None)
+    if not callable(deliberate):
+        return
+    info = env.reset(seed=seed)[1]
+    deliberate(2, 10)
+    told = list(env.step(_some_action(info, random.Random(seed)))[4].get("thought") or ())
+    if told != [2, 10]:
+        yield f"after deliberate(2, 10) the step reports info['thought'] {told}; expected [2, 10]"
 
 
 def _ends(env: Any, seed: int, steps: int) -> Iterator[str]:

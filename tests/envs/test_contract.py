@@ -140,6 +140,15 @@ def test_a_menu_entry_that_cannot_be_done_is_a_fault() -> None:
         check_environment(Boasting(menu=True))
 
 
+def test_charged_thinking_is_reported() -> None:
+    class Forgetful(NumbersEnv):
+        def deliberate(self, calls: int, tokens: int) -> None:
+            return None
+
+    with pytest.raises(ContractError, match=r"reports info\['thought'\] \[\]; expected \[2, 10\]"):
+        check_environment(Forgetful())
+
+
 def test_half_a_pair_of_snapshot_methods_is_a_fault() -> None:
     class Half(NumbersEnv):
         restore = None  # type: ignore[assignment]
