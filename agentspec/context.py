@@ -169,7 +169,10 @@ class Context:
 
     def snapshot(self) -> bytes:
         """Exact state as bytes."""
-        turns = [{"role": m.role, "content": [_part_to_json(p) for p in m.content]} for m in self._turns]
+        turns = [
+            {"role": m.role, "content": [_part_to_json(p) for p in m.content if not isinstance(p, Picture)]}
+            for m in self._turns
+        ]
         opened = None if self._open is None else self._open.text
         return dump_state(
             {
