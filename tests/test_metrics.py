@@ -113,6 +113,9 @@ def test_columns_are_declared_figures_then_the_scaffolds() -> None:
         {"env": "gone-v0", "return": 2.0, "hourly_profit": None},
     ]
     assert [m.name for m in columns(rows)] == ["net_earnings", "success", "return", "steps"]
+    # Nobody knows the second environment any more; its figures are shown all the same.
+    kept = [{"env": "gone-v0", "seed": 3, "rollout": 0, "laps": 4.0, "note": "x", "return": 1.0}]
+    assert [m.heading for m in columns(kept)] == ["laps", "return"]
     assert [m.unit for m in declared("deliverybench")] == ["$/h", "$", ""]
     assert declared("gone-v0") == () and typical_return("gone-v0") == 1.0 and typical_return(TOY) == 25.0
 

@@ -58,14 +58,19 @@ def make_env(task: Task) -> Any:
 
 
 def environment_class(name: str) -> Any:
-    """The class (or function) that makes an environment, or `None` if there is none of this name or it cannot load."""
+    """The class (or function) that makes an environment, or `None` if there is none of this name or it cannot load.
+
+    Names may come from recorded rows: unlike `environment_id`, this imports no module that a name asks for.
+    """
+    known = REGISTRY.entries.get("env", {})
+    plain = known[name].target if name in known else name.rpartition(":")[2]
     try:
-        entry_point = gymnasium.registry[environment_id(name)].entry_point
+        entry_point = gymnasium.registry[plain].entry_point
         if not isinstance(entry_point, str):
             return entry_point
         module, _, attribute = entry_point.partition(":")
         return getattr(importlib.import_module(module), attribute)
-    except (SpecError, ImportError, AttributeError):
+    except (KeyError, ImportError, AttributeError):
         return None
 
 
