@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from agentspec.registry import REGISTRY, SpecError
+from agentspec.envs.making import short_names
+from agentspec.registry import SpecError
 from agentspec.types import Task
 
 SPLITS = {"train": 0, "validation": 10_000, "test": 20_000}
@@ -64,4 +65,4 @@ def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
 
 def environment_name(env: str) -> str:
     """The registered short name of an environment, or its id."""
-    return next((name for name, entry in REGISTRY.entries.get("env", {}).items() if entry.target == env), env)
+    return next((name for name, target in short_names().items() if target == env), env)

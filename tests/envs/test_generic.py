@@ -174,6 +174,13 @@ def test_what_an_environment_draws_can_be_its_image() -> None:
     assert "mission: get to the green goal square" in observation["text"] and observation["text"].count("\n") < 14
 
 
+def test_success_is_passed_on_where_the_environment_knows_it() -> None:
+    for told in ({"is_success": np.True_}, {"success": 1}):
+        info = started(Space(spaces.Discrete(2), told=told)).step("action 0")[4]
+        assert info["success"] is True and info["metrics"] == {"success": True}
+    check_environment(TextAdapter(Space(spaces.Discrete(2), told={"is_success": 0}), "Space-v0"))
+
+
 def test_a_text_environment_is_left_alone() -> None:
     env = make_env(Task("deliverybench", options={"size": "tiny"}))
     assert keeps_contract(env) and adapted(env, "x") is env

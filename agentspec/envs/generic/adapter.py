@@ -168,8 +168,10 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
             observation["image"] = self._picture()
         told = as_json(self._told) if isinstance(self._told, Mapping) else {}
         success = told.get("success", told.get("is_success"))
+        achieved = {} if success is None else {"success": bool(success)}
         info = {
             **told,
+            **achieved,
             "instruction": self._instruction(),
             "action_schema": self._schema(),
             "state": {"observation": plain(space, self._seen), "steps": self._steps},
@@ -177,7 +179,7 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
             "error_code": code,
             "message": f"failed: {error}" if error else "ok" if self._steps else "",
             "invalid": bool(error),
-            "metrics": {} if success is None else {"success": bool(success)},
+            "metrics": achieved,
         }
         self._over = terminated or truncated
         self._last = (observation, terminated, truncated, info)
