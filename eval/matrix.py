@@ -223,7 +223,8 @@ def _setting(
         SpecError: the file has lines of this pair from another configuration.
     """
     spec = settings.apply(policy.apply(spec))
-    start = start_bank(settings.start_memory if spec.scope == "run" else "", spec)
+    grown = spec.scope == "run" and not policy.scripted  # a scripted policy learns nothing and takes up nothing
+    start = start_bank(settings.start_memory if grown else "", spec)
     fingerprints = _fingerprints(
         [spec.to_data(), policy.identity(), settings.seed, settings.max_steps], spec, sets, start
     )

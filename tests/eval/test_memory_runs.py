@@ -69,6 +69,8 @@ def test_a_memory_grown_elsewhere_is_evaluated(tmp_path: Path) -> None:
     save_bank(tmp_path / "run" / FILE, bank)
     _, idler = play(tmp_path / "grown", {"a": TASKS[:1], "b": TASKS[1:2]}, start_memory=str(tmp_path / "run"))
     assert idler.seen == [[1, 2], [1, 2]]  # every chain starts from it
+    # A scripted policy beside it has no use for a memory, and does not stop the evaluation.
+    evaluate([Policy("random")], {"s": SPEC}, MENU, out=tmp_path / "random", start_memory=str(tmp_path / "run"))
     # It is part of what rows depend on.
     save_bank(tmp_path / "run" / FILE, MemoryBank.of_spec(SPEC))
     with pytest.raises(SpecError, match="start memory"):
