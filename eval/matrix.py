@@ -51,7 +51,7 @@ class Settings:
         prices: dollars per token, by model name.
         trajectories: keep every episode under ``trajectories/``.
         start_memory: for scaffolds with ``scope: run``, a memory file or the folder of a run that wrote one: every
-            chain of episodes starts from it.
+            chain of episodes starts from it. A mapping gives policies, by name, starts of their own; others have none.
         retry_failed: play cells again whose line says that they failed.
         replace_stale: play cells again whose line is from another configuration (retrained weights, say) instead of
             refusing them.
@@ -65,7 +65,7 @@ class Settings:
     max_steps: int | None = None
     prices: Prices = field(default_factory=Prices)
     trajectories: bool = False
-    start_memory: str = ""
+    start_memory: str | Mapping[str, str] = ""
     retry_failed: bool = False
     replace_stale: bool = False
 
@@ -76,6 +76,16 @@ class Settings:
         for name in self.sampling or ():
             if name not in names:
                 raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
+
+    def start_of(self, policy: Policy, spec: AgentSpec) -> MemoryBank:
+        """The memory that chains of episodes start from: nothing where nothing outlives an episode, or learns.
+
+        Raises:
+            SpecError: no such file, or one of other modules than the scaffold's.
+        """
+        given = self.start_memory
+        source = given if isinstance(given, str) else given.get(policy.name, "")
+        return start_bank(source if spec.scope == "run" and not policy.scripted else "", spec)
 
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
@@ -141,6 +151,10 @@ def evaluate(
         raise SpecError("start_memory is given, but no scaffold has `scope: run`: every episode would start empty")
     sets = task_sets(tasks)
     _check_names(policies, specs)
+    if isinstance(settings.start_memory, Mapping):
+        for name in settings.start_memory:
+            if name not in (known := [p.name for p in policies]):
+                raise SpecError(f"start_memory names the policy {name!r}{suggest(name, known)}")
     results = Results(out)
     labels = {task.key: label for label, members in sets.items() for task in members}
     plan = [
@@ -223,8 +237,7 @@ def _setting(
         SpecError: the file has lines of this pair from another configuration.
     """
     spec = settings.apply(policy.apply(spec))
-    grown = spec.scope == "run" and not policy.scripted  # a scripted policy learns nothing and takes up nothing
-    start = start_bank(settings.start_memory if grown else "", spec)
+    start = settings.start_of(policy, spec)
     fingerprints = _fingerprints(
         [spec.to_data(), policy.identity(), settings.seed, settings.max_steps], spec, sets, start
     )

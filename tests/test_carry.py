@@ -123,6 +123,18 @@ def test_a_start_that_cannot_work_is_refused(tmp_path: Path) -> None:
     assert start_bank("", SPEC) == MemoryBank(("none", "reflexion"))
 
 
+def test_memories_are_given_to_policies_by_name(tmp_path: Path) -> None:
+    from agentspec.cli.evaluate import start_memory
+
+    odd = tmp_path / "a=b"
+    odd.mkdir()
+    assert start_memory([]) == {} and start_memory(["runs/x"]) == "runs/x" and start_memory([str(odd)]) == str(odd)
+    assert start_memory(["p=runs/x"]) == {"p": "runs/x"}
+    assert start_memory(["p=runs/x", "q=y.json"]) == {"p": "runs/x", "q": "y.json"}
+    with pytest.raises(SpecError, match="expected POLICY=FILE for each"):
+        start_memory(["runs/x", "runs/y"])
+
+
 def test_the_command_line_carries_memory_and_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "agent.yaml").write_text(SPEC.to_yaml())
     idlers: list[Idler] = []

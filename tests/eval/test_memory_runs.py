@@ -71,6 +71,19 @@ def test_a_memory_grown_elsewhere_is_evaluated(tmp_path: Path) -> None:
     assert idler.seen == [[1, 2], [1, 2]]  # every chain starts from it
     # A scripted policy beside it has no use for a memory, and does not stop the evaluation.
     evaluate([Policy("random")], {"s": SPEC}, MENU, out=tmp_path / "random", start_memory=str(tmp_path / "run"))
+    # The same model with and without it, side by side.
+    seen: dict[str, Idler] = {"with": Idler(), "without": Idler()}
+    evaluate(
+        [Policy("with", "x"), Policy("without", "x")],
+        {"s": SPEC},
+        TASKS[:1],
+        out=tmp_path / "both",
+        make_llm=lambda policy: ScriptedLLM(seen[policy.name]),
+        start_memory={"with": str(tmp_path / "run")},
+    )
+    assert (seen["with"].seen, seen["without"].seen) == ([[1, 2]], [[]])
+    with pytest.raises(SpecError, match="did you mean idler"):
+        play(tmp_path / "misnamed", TASKS, start_memory={"idle": str(tmp_path / "run")})
     # It is part of what rows depend on.
     save_bank(tmp_path / "run" / FILE, MemoryBank.of_spec(SPEC))
     with pytest.raises(SpecError, match="start memory"):
