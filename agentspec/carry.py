@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from agentspec.state import dump_state, write_atomic
+from agentspec.state import dump_state
 from agentspec.types import Task
 
 if TYPE_CHECKING:

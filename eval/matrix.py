@@ -25,6 +25,7 @@ from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
 from agentspec.metrics import episode_row
 from agentspec.policies import Policy
+from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.tasks import Tasks, task_sets
@@ -214,6 +215,7 @@ async def _play(
             max_steps=settings.max_steps,
             prices=settings.prices,
             policy=setting.policy.name,
+            progress=episode_progress,
             on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
         )
         if setting.spec.scope == "run":

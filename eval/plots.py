@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from agentspec.files import write_atomic
 from agentspec.metrics import Metric
-from agentspec.state import write_atomic
 from eval.tables import CellSummary, metrics_of
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from agentspec.files import write_atomic
 from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
-from agentspec.state import write_atomic
 from eval.statistics import Estimate, bootstrap, paired_difference
 
 Row = Mapping[str, Any]

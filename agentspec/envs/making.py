@@ -23,7 +23,7 @@ PROVIDERS = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniwor
 
 def short_names() -> Mapping[str, str]:
     """Registered short name -> gymnasium id."""
-    return {name: entry.target for name, entry in REGISTRY.entries.get("env", {}).items()}
+    return {name: entry.target for name, entry in REGISTRY.all("env").items()}
 
 
 def environment_id(name: str) -> str:

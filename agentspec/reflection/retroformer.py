@@ -12,7 +12,7 @@ followed by a trial of their own, so their rewards compare like with like.
 
 ``when`` says in which of the two trials the lesson is written: at the ``end`` of the failed one, or at the ``start`` of
 the next. What the reflector reads is the same. With ``start`` a lesson and the trial that pays it are one episode, so
-that many lessons can be drawn from the memory that one failed trial left: :mod:`trainers.retroformer` trains on these.
+that many lessons can be drawn from the memory that one failed trial left: a trainer may learn from these.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.protocols import Services
@@ -82,6 +83,14 @@ class Retroformer(Reflexion):
         when: whether a lesson is written at the ``end`` of the failed trial or at the ``start`` of the next one.
         temperature: sampling temperature of lessons (``None``: the agent's).
     """
+
+    declaration = Declaration(
+        "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
+        calls=CallProfile(episode=(0, 1)),
+        purposes={"reflect": Purpose("episode")},
+        small=({"when": "start"},),
+        small_calls=CallProfile(retrieve=(0, 1)),
+    )
 
     name = "retroformer"
 
