@@ -50,7 +50,7 @@ def adapted(env: Any, name: str) -> Any:
     if not keeps_contract(env):
         return TextAdapter(env, name)
     limited = env.spec is not None and env.spec.max_episode_steps is not None
-    return FinishedEpisode(env) if limited else env
+    return FinishedEpisode(env) if limited and not isinstance(env, FinishedEpisode) else env
 
 
 class TextAdapter(gymnasium.Env[dict[str, Any], str]):
