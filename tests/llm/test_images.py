@@ -102,8 +102,9 @@ def test_the_map_of_deliverybench_reaches_an_endpoint(server: Server) -> None:  
     env = make_env(MAP)
     observation, info = env.reset(seed=0)
     first = info["action_schema"].choices[0]
-    expected = [observation["image"], env.step(first)[0]["image"]]
-    server.script = [answer(first)]
+    after, *_, told = env.step(first)
+    expected = [observation["image"], after["image"]]
+    server.script = [answer(first), answer(told["action_schema"].choices[0])]
     [played] = Runner(SEEING, llm(server), max_steps=2).run([Job(MAP)])
     assert played.status == "completed" and len(server.bodies) == 2
     for body, drawn in zip(server.bodies, expected, strict=True):
