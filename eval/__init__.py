@@ -5,8 +5,8 @@ bootstrap intervals; :mod:`eval.plots` draws them. Only ``agentspec`` is importe
 scaffold can be measured, trained by this project or not.
 """
 
+from agentspec.policies import Policy
 from eval.matrix import evaluate
-from eval.policies import Policy
 from eval.results import Results
 from eval.statistics import Estimate, bootstrap, paired_difference
 

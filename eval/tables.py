@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import write_atomic
-from eval.metrics import BY_NAME, CUT_SHORT, METRICS, primary_metric
+from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
 from eval.statistics import Estimate, bootstrap, paired_difference
 
 Row = Mapping[str, Any]
@@ -22,7 +22,10 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class CellSummary:
-    """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it."""
+    """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it.
+
+    `metrics` says what the names in `estimates` are called and whether more is better, the primary one first.
+    """
 
     tasks: str
     policy: str
@@ -31,6 +34,7 @@ class CellSummary:
     failed: int
     cut_short: int
     estimates: Mapping[str, Estimate]
+    metrics: tuple[Metric, ...] = ()
 
     def to_data(self) -> dict[str, Any]:
         """JSON values."""
@@ -51,14 +55,12 @@ def summarise(rows: Sequence[Row], *, level: float = 0.95, seed: int = 0) -> lis
     """All cells, in the order of their first rows; metrics without any number are left out of ``estimates``."""
     cells = []
     for (tasks, policy, scaffold), members in _grouped(rows).items():
-        estimates = {}
-        for metric in METRICS:
-            values = list(values_by_task(members, metric.name).values())
-            if values:
-                estimates[metric.name] = bootstrap(values, level=level, seed=seed)
+        values = {metric.name: list(values_by_task(members, metric.name).values()) for metric in columns(members)}
+        estimates = {name: bootstrap(v, level=level, seed=seed) for name, v in values.items() if v}
         failed = sum(r["status"] != "completed" for r in members)
         cut = sum(r["status"] == "completed" and r.get("ended") in CUT_SHORT for r in members)
-        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates))
+        shown = tuple(metric for metric in columns(members) if metric.name in estimates)
+        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates, shown))
     return cells
 
 
@@ -95,8 +97,8 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
     for tasks in dict.fromkeys(row["tasks"] for row in rows):
         members = [r for r in rows if r["tasks"] == tasks]
         cells = summarise(members, level=level)
-        primary = primary_metric(list(members))
-        heading, digits = BY_NAME[primary].heading, BY_NAME[primary].digits
+        metric = primary_metric(members)
+        primary, heading, digits = metric.name, metric.heading, metric.digits
         parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} bootstrap interval.", ""]
         parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
@@ -122,7 +124,11 @@ def write_report(rows: Sequence[Row], folder: str | Path, *, level: float = 0.95
     """Write ``results.md`` and ``summary.json`` beside ``results.jsonl``."""
     folder = Path(folder)
     write_atomic(folder / "results.md", markdown(rows, level=level))
-    data = {"level": level, "cells": [c.to_data() for c in summarise(rows, level=level)]}
+    metrics = [
+        {"name": m.name, "unit": m.unit, "heading": m.heading, "higher_is_better": m.higher_is_better}
+        for m in columns(rows)
+    ]
+    data = {"level": level, "metrics": metrics, "cells": [c.to_data() for c in summarise(rows, level=level)]}
     write_atomic(folder / "summary.json", json.dumps(data, indent=2, sort_keys=True) + "\n")
 
 
@@ -153,8 +159,15 @@ def _matrix(cells: Sequence[CellSummary], metric: str, digits: int) -> list[str]
     return table(["policy", *scaffolds], body)
 
 
+def metrics_of(cells: Sequence[CellSummary]) -> list[Metric]:
+    """The metrics of any of the cells, in the order of tables."""
+    found = {metric.name: metric for cell in cells for metric in cell.metrics}
+    order = max((cell.metrics for cell in cells), key=len, default=())
+    return [*order, *(metric for metric in found.values() if metric not in order)]
+
+
 def _details(cells: Sequence[CellSummary]) -> list[str]:
-    metrics = [m for m in METRICS if any(m.name in c.estimates for c in cells)]
+    metrics = metrics_of(cells)
     header = ["policy", "scaffold", "episodes", "failed", "cut short", *(m.heading for m in metrics)]
     body = []
     for c in cells:

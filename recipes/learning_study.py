@@ -117,11 +117,11 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
         seeds: method -> training seeds.
         own: method -> label of the scaffold it was trained in.
     """
-    from eval.metrics import BY_NAME, primary_metric
+    from agentspec.metrics import primary_metric
     from eval.tables import table, values_by_task
 
-    metric = primary_metric(list(rows))
-    digits = BY_NAME[metric].digits
+    primary = primary_metric(rows)
+    metric, digits = primary.name, primary.digits
     scaffolds = list(dict.fromkeys(row["scaffold"] for row in rows))
     cells = {
         (policy, s): values_by_task([r for r in rows if (r["policy"], r["scaffold"]) == (policy, s)], metric)
@@ -144,7 +144,7 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
         "tasks",
     ]
     lines = [
-        f"# {BY_NAME[metric].heading} before and after training",
+        f"# {primary.heading} before and after training",
         "",
         "Greedy, on held-out tasks, paired by task. Intervals: 95 % bootstrap; per seed over tasks, for all seeds over",
         "training seeds and tasks together. An interval that contains 0 is a tie.",

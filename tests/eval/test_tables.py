@@ -18,6 +18,7 @@ from eval.tables import differences, markdown, show, summarise, table, write_rep
 
 def row(policy: str, task: str, profit: float | None, *, scaffold: str = "plain", **changes: Any) -> dict[str, Any]:
     return {
+        "env": "deliverybench",
         "tasks": "city",
         "policy": policy,
         "scaffold": scaffold,

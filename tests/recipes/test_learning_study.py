@@ -18,6 +18,7 @@ from trainers.arguments import parse_config
 def rows(policy: str, scaffold: str, values: list[float]) -> list[dict[str, object]]:
     return [
         {
+            "env": "deliverybench",
             "policy": policy,
             "scaffold": scaffold,
             "tasks": "t",
