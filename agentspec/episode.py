@@ -122,6 +122,9 @@ class Runner:
         timeout_s: limit of every environment call, in seconds (``None``: none).
         max_steps: most steps of an episode, on top of the environment's own limit.
         policy: label of the policy, for tables.
+        on_done: called with each episode when it has ended.
+        on_step: called with the task and each step of its episode when it was taken.
+        progress: number of jobs -> what to call after each (`agentspec.progress.episode_progress`).
     """
 
     spec: AgentSpec
@@ -134,6 +137,8 @@ class Runner:
     embedder: Embedder | None = None
     policy: str = ""
     on_done: Callable[[Trajectory], None] | None = None
+    on_step: Callable[[Task, Transition], None] | None = None
+    progress: Callable[[int], Callable[[Trajectory], None]] | None = None
 
     def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """Run all jobs; trajectories come back in the order of the jobs."""
@@ -144,13 +149,14 @@ class Runner:
         llm: LLM = self.llm or NoLLM()
         self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
         helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items() if self.spec.helped(pattern)}
+        progress = self.progress(len(jobs)) if self.progress else None
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:
             async with gate:
                 trajectory = await self._episode(job, llm, helpers)
-            if self.on_done:
-                self.on_done(trajectory)
+            for tell in filter(None, (self.on_done, progress)):
+                tell(trajectory)
             return trajectory
 
         return list(await asyncio.gather(*(guarded(job) for job in jobs)))
@@ -206,6 +212,8 @@ class Runner:
                     ended = "budget"
                     break
                 transitions.append(transition)
+                if self.on_step:
+                    self.on_step(job.task, transition)
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)
