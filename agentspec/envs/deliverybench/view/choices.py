@@ -69,9 +69,9 @@ class Option:
 # -- orders ------------------------------------------------------------------------------------------------------------
 
 
-def work_here(view: View) -> list[Option]:
-    """What can be done for the open orders without moving: deliver, bag, pick up, wait for the kitchen."""
-    found = []
+def work_here(view: View) -> tuple[list[Option], list[Option]]:
+    """What can be done for the open orders without moving: deliver, bag, pick up; and waits for the kitchen here."""
+    found, patience = [], []
     for order in view["orders"]:
         method, place = calls.handover(order)
         if order["status"] in (IN_BAG, IN_HAND) and within_reach(view, place):
@@ -87,8 +87,8 @@ def work_here(view: View) -> list[Option]:
     for order in sorted((o for o in here if o["status"] == PREPARING), key=lambda order: order["ready_in_s"]):
         seconds = order["ready_in_s"]
         text, note = f"wait for order {order['id']}", duration(seconds)
-        found.append(Option(text, calls.wait(max(1.0, seconds)), "wait", note, 0.0, seconds))
-    return found
+        patience.append(Option(text, calls.wait(max(1.0, seconds)), "wait", note, 0.0, seconds))
+    return found, patience
 
 
 def ways(view: View) -> list[tuple[Option, Option]]:

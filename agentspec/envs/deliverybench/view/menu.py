@@ -17,11 +17,11 @@ from agentspec.envs.deliverybench.view.calls import View, within_reach
 from agentspec.envs.deliverybench.view.choices import Option
 
 MAX_CHOICES = 12
-MAX_WAYS, MAX_OFFERS = 5, 4
+MAX_WAYS, MAX_OFFERS = 5, 3
 """Ways and offers on the first page, which is kept short; the others follow."""
 
 LOW_BATTERY, LOW_ENERGY, THIRSTY = 40.0, 40.0, 50.0
-CAR_FROM_S, CAR_MONEY = 900.0, 30.0
+CAR_FROM_S, CAR_MONEY, CAR_ACTIONS = 900.0, 30.0, 40
 MORE = Option("more choices", "", "more")
 
 
@@ -50,8 +50,10 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
     rent = _car_pays(view)
     cars = choices.car(view)
     waits = choices.waits(view)
+    work, patience = choices.work_here(view)
     first = [
-        *choices.work_here(view),
+        *work,
+        *patience[:1],
         *choices.mounts(view),
         *(cars if rent else ()),
         *(way for way, _ in ways[:MAX_WAYS]),
@@ -61,6 +63,7 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
         waits[0],
     ]
     others = [
+        *patience[1:],
         *(way for way, _ in ways[MAX_WAYS:]),
         *offered[MAX_OFFERS:],
         *later,
@@ -87,6 +90,8 @@ def _car_pays(view: View) -> bool:
     rental = view["nearest"].get("car_rental")
     if view["car"] is not None or rental is None or view["balance"] < CAR_MONEY:
         return False
+    if view["calls_left"] is not None and view["calls_left"] < CAR_ACTIONS:
+        return False
     return bool(view["left_s"] - rental["m"] / view["speed"] >= CAR_FROM_S)
 
 
@@ -106,8 +111,7 @@ def _care(view: View) -> tuple[list[Option], list[Option]]:
     visiting = store is not None and within_reach(view, store["xy"])
     for option in choices.shopping(view):
         drink, pack = option.text == "buy energy drink", option.text == "buy battery pack"
-        needed = (drink and view["energy"] + 50.0 * view["inventory"].get(choices.DRINK, 0) < 100.0) or (pack and low)
-        urgent = needed if visiting else (tired or low) and not view["inventory"]
+        urgent = drink or (pack and low) if visiting else (tired or low) and not view["inventory"]
         (now if urgent else later).append(option)
     return now, later
 
