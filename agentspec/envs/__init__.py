@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from agentspec.registry import register
+
 if TYPE_CHECKING:
     from agentspec.envs.contract import ContractError, check_environment
     from agentspec.envs.making import environment_id, make_env
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    "agentspec/MiniGrid-v0": "agentspec.envs.minigrid.env:MiniGridEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
 
@@ -64,3 +67,15 @@ def __getattr__(name: str) -> Any:
 
 
 register_all()
+register(
+    "env",
+    "deliverybench",
+    "agentspec/DeliveryBench-v0",
+    "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+)
+register(
+    "env",
+    "minigrid",
+    "agentspec/MiniGrid-v0",
+    "MiniGrid and BabyAI grids: egocentric text, success within 100 steps, the paper's ten tasks",
+)

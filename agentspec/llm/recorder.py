@@ -11,11 +11,11 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 from agentspec.llm.base import LLM, LLMError, Message, Request
 from agentspec.llm.pricing import Prices
+from agentspec.tags import matches
 from agentspec.types import CallTag, Credit, LLMCall, Sampling, Usage
 
 
@@ -110,7 +110,7 @@ class Recorder:
         call_id, self._next_id = self._next_id, self._next_id + 1
         request = Request(
             messages=tuple(messages),
-            sampling=replace(self.sampling, **overrides),
+            sampling=replace(self.sampling, **overrides).with_room(),
             tag=CallTag(module, purpose, self.episode, self.step, branch),
             seed=derive_seed(self.seed, call_id),
             id=call_id,
@@ -132,7 +132,7 @@ class Recorder:
 
     def backend(self, module: str) -> LLM:
         """Who answers the calls of `module`."""
-        return next((llm for pattern, llm in self.helpers.items() if fnmatchcase(module, pattern)), self.llm)
+        return next((llm for pattern, llm in self.helpers.items() if matches(f"{module}/", pattern)), self.llm)
 
     async def score(
         self, messages: Sequence[Message], continuations: Sequence[str], module: str = ""
