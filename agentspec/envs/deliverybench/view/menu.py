@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agentspec.envs.deliverybench.view import calls, choices
+from agentspec.envs.deliverybench.view import calls, choices, upkeep
 from agentspec.envs.deliverybench.view.calls import View, within_reach
 from agentspec.envs.deliverybench.view.choices import Option
 
@@ -48,13 +48,13 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
     offered = choices.offers(view)
     care, later = _care(view)
     rent = _car_pays(view)
-    cars = choices.car(view)
-    waits = choices.waits(view)
+    cars = upkeep.car(view)
+    waits = upkeep.waits(view)
     work, patience = choices.work_here(view)
     first = [
         *work,
         *patience[:1],
-        *choices.mounts(view),
+        *upkeep.mounts(view),
         *(cars if rent else ()),
         *(way for way, _ in ways[:MAX_WAYS]),
         *offered[:MAX_OFFERS],
@@ -69,8 +69,8 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
         *later,
         *(way for _, way in ways),
         *cars,
-        *choices.bus(view),
-        *choices.on_foot(view),
+        *upkeep.bus(view),
+        *upkeep.on_foot(view),
         *waits[1:],
     ]
     if calls.hands_full(view) and view["hands_must_be_free"] and view["mode"] != "walk":
@@ -102,14 +102,14 @@ def _care(view: View) -> tuple[list[Option], list[Option]]:
     scooter = view["mode"] in ("e-scooter", "drag_scooter")
     low = scooter and view["battery"] <= LOW_BATTERY
     tired = view["energy"] <= LOW_ENERGY
-    for option in choices.using(view):
+    for option in upkeep.using(view):
         wanted = view["energy"] <= THIRSTY if "drink" in option.text else low
         (now if wanted and "into" not in option.text else later).append(option)
-    for group, wanted in ((choices.charging(view), low), (choices.resting(view), tired)):
+    for group, wanted in ((upkeep.charging(view), low), (upkeep.resting(view), tired)):
         (now if wanted else later).extend(group)
     store = view["nearest"].get("store")
     visiting = store is not None and within_reach(view, store["xy"])
-    for option in choices.shopping(view):
+    for option in upkeep.shopping(view):
         drink, pack = option.text == "buy energy drink", option.text == "buy battery pack"
         urgent = drink or (pack and low) if visiting else (tired or low) and not view["inventory"]
         (now if urgent else later).append(option)
