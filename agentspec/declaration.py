@@ -65,8 +65,9 @@ class Declaration:
         needs: backend capabilities (`score`, `n`, ...), `snapshots` of the environment, or an `embedder`.
         waived: need -> (parameter, value): with that value the method does without the need.
         envs: registered environments the method is written for; empty: any.
-        small: parameters under which everything the method does fires within a dozen steps; for tests.
-        small_calls: the call profile under `small`; `None`: as `calls`.
+        small: for the contract tests, sets of parameters under which, together, everything the method does fires
+            within a dozen steps.
+        small_calls: the call profile under each of `small`; `None`: as `calls`.
         scope: `run` for a method that is of no use within one episode: a spec with another scope is refused.
         name: name in a spec; empty: the name of the file in this package, outside it the class's name in snake case.
         aliases: other names.
@@ -79,7 +80,7 @@ class Declaration:
     needs: tuple[str, ...] = ()
     waived: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
     envs: tuple[str, ...] = ()
-    small: Mapping[str, Any] = field(default_factory=dict)
+    small: tuple[Mapping[str, Any], ...] = ()
     small_calls: CallProfile | None = None
     scope: str = ""
     name: str = ""

@@ -22,6 +22,7 @@ from agentspec.agent import Agent
 from agentspec.envs import environment_id, make_env
 from agentspec.llm.base import LLM, ContextOverflowError, LLMError
 from agentspec.llm.helpers import helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
@@ -121,6 +122,9 @@ class Runner:
         timeout_s: limit of every environment call, in seconds (``None``: none).
         max_steps: most steps of an episode, on top of the environment's own limit.
         policy: label of the policy, for tables.
+        on_done: called with each episode when it has ended.
+        on_step: called with the task and each step of its episode when it was taken.
+        progress: number of jobs -> what to call after each (`agentspec.progress.episode_progress`).
     """
 
     spec: AgentSpec
@@ -133,6 +137,8 @@ class Runner:
     embedder: Embedder | None = None
     policy: str = ""
     on_done: Callable[[Trajectory], None] | None = None
+    on_step: Callable[[Task, Transition], None] | None = None
+    progress: Callable[[int], Callable[[Trajectory], None]] | None = None
 
     def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """Run all jobs; trajectories come back in the order of the jobs."""
@@ -142,14 +148,15 @@ class Runner:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
         self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
-        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items()}
+        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items() if self.spec.helped(pattern)}
+        progress = self.progress(len(jobs)) if self.progress else None
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:
             async with gate:
                 trajectory = await self._episode(job, llm, helpers)
-            if self.on_done:
-                self.on_done(trajectory)
+            for tell in filter(None, (self.on_done, progress)):
+                tell(trajectory)
             return trajectory
 
         return list(await asyncio.gather(*(guarded(job) for job in jobs)))
@@ -205,6 +212,8 @@ class Runner:
                     ended = "budget"
                     break
                 transitions.append(transition)
+                if self.on_step:
+                    self.on_step(job.task, transition)
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)
@@ -314,29 +323,6 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "problems": sum(recorder.problems.values()),
         "ended": ended,
     }
-
-
-class NoLLM:
-    """The backend of agents without a model: any call is an error that says so."""
-
-    name = "none"
-    capabilities: frozenset[str] = frozenset()
-    max_context = 0
-
-    async def generate(self, request: Any) -> Any:
-        raise LLMError(f"{request.tag.path} asked for a model, but none was configured; name one with `--model`")
-
-    async def score(self, messages: Any, continuations: Any, *, episode: str = "") -> Any:
-        raise LLMError("a module asked for scores, but no model was configured; name one with `--model`")
-
-    def count_tokens(self, text: str) -> int:
-        return len(text) // 4 + 1
-
-    def enter(self, episode: str) -> None:
-        return None
-
-    def leave(self, episode: str) -> None:
-        return None
 
 
 __all__ = ["EnvWorker", "EnvironmentFailedError", "Job", "NoLLM", "Runner", "environment_id", "make_env"]

@@ -133,7 +133,7 @@ def fill(document: str, section: str, body: str) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Measure and print the tables, or JSON."""
-    parser = argparse.ArgumentParser(description="Generated cities beside the originals'.")
+    parser = argparse.ArgumentParser(allow_abbrev=False, description="Generated cities beside the originals'.")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--cities", type=int, default=4, help="generated cities of each size")
     parser.add_argument("--seeds", type=int, default=3, help="order seeds (and shifts) of each city")

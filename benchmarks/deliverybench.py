@@ -272,7 +272,9 @@ def table(result: dict[str, Any]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Measure and print a table, or JSON."""
-    parser = argparse.ArgumentParser(description="Speed and size of the DeliveryBench environment on one core.")
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description="Speed and size of the DeliveryBench environment on one core."
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--map", help="map folder (default: see the module's description)")
     parser.add_argument("--shifts", type=int, default=8, help="recorded one-hour shifts")

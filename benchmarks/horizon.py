@@ -152,7 +152,7 @@ def draw(results: dict[str, list[dict[str, Any]]], unit: str, path: Path) -> Non
 
 def main() -> None:
     """All lengths for both agents; a table or JSON, and the plot."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--turns", type=int, nargs="+", default=[8, 16, 32, 64, 128])
     parser.add_argument("--model", default="", help="a model to sample from (default: a script)")
     parser.add_argument("--words", type=int, default=40, help="words of news in an observation")

@@ -251,7 +251,7 @@ def run_slow(options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """All numbers of turns and the slow environments; a table or JSON."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--model", default="smollm2-135m")
     parser.add_argument("--turns", type=int, nargs="*", default=[4, 8, 16])
     parser.add_argument("--rollouts", type=int, default=8, help="episodes, in groups of four")

@@ -106,7 +106,7 @@ def our_update(trainer: Any, rows: Sequence[Any], count: int) -> Callable[[], No
     _accumulate(trainer, count)
 
     def run() -> None:
-        for part in trainer._micro_batches(rows, count):
+        for part in trainer._collated(trainer._partitioned(rows)):
             trainer._compute_loss(trainer.model, part).backward()
 
     return run
@@ -260,7 +260,7 @@ def _release() -> None:
 
 def main() -> None:
     """Run all layouts and print a table, or JSON."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--model", default="smollm2-135m")
     parser.add_argument("--rollouts", type=int, default=4, help="8 and 12 turns take stock TRL more than 24 GB")
     parser.add_argument("--turns", type=int, help="of every layout (default: 8, supo 16)")

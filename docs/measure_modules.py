@@ -14,10 +14,10 @@ from typing import Any
 from update_modules import PAGE
 
 from agentspec.episode import Job, Runner
+from agentspec.files import write_atomic
 from agentspec.llm.local import LocalLLM
 from agentspec.registry import REGISTRY
 from agentspec.spec import AgentSpec
-from agentspec.state import write_atomic
 from agentspec.types import Task
 
 BEGIN, END = "<!-- generated: measured costs -->", "<!-- end of costs -->"
@@ -83,7 +83,7 @@ def with_rows(page: str, rows: dict[str, str]) -> str:
 
 def main() -> None:
     """Measure the methods named (all by default); each row is written as soon as it is known."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__)
     parser.add_argument("method", nargs="*")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--model", default="smollm2-135m")

@@ -8,12 +8,15 @@ continues from the last checkpoint. On a GPU machine only the config changes (``
 
 from __future__ import annotations
 
-from recipes.common import draw_curve, parse_config, run_recipe, train
+from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
     """Train, save the adapter, draw the reward curve."""
-    config = parse_config()
+    from trainers.arguments import parse_config
+    from trainers.run import train
+
+    config = parse_config(default=CONFIGS / "quickstart_cpu.yaml")
     draw_curve(config, train(config))
 
 

@@ -17,21 +17,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from recipes.common import parse_config, run_recipe
+from recipes.common import run_recipe
 
 START = "start"
 
 
 def main() -> None:
     """Train what is not trained, evaluate what is not evaluated, write the report."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    from trainers.arguments import parse_config
+
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
     parser.add_argument("--configs", nargs="+", required=True, help="training configurations, one per method")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="training seeds")
     parser.add_argument("--out", default="runs/study", help="folder of all runs and of the report")
     parser.add_argument("--no-train", action="store_true", help="evaluate the runs that are there")
     options = parser.parse_args()
     out = Path(options.out)
-    configs = {Path(path).stem: parse_config(["--config", path]) for path in options.configs}
+    configs = {Path(path).stem: parse_config(default=path, argv=[]) for path in options.configs}
     check(configs)
     runs = {name: {seed: out / f"{name}-s{seed}" for seed in options.seeds} for name in configs}
     if not options.no_train:
@@ -74,8 +76,8 @@ def train(path: str, seed: int, folder: Path) -> None:
 
 def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], out: Path) -> None:
     """Play the matrix and write tables and curves."""
+    from agentspec.files import write_atomic
     from agentspec.llm.models import resolve_adapter
-    from agentspec.state import write_atomic
     from eval.matrix import Policy, evaluate
     from eval.plots import learning_curves
     from eval.tables import write_report

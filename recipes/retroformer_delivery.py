@@ -15,15 +15,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recipes.common import draw_curve, parse_config, run_recipe, train
+from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
     """Train the reflector, draw the curve of gains, evaluate: ``evaluation.md`` and ``evaluation.jsonl``."""
+    from trainers.arguments import parse_config
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import RetroformerTrainer, as_retroformer
+    from trainers.run import train
 
-    config = as_retroformer(parse_config(default="retroformer_cpu.yaml"))
+    config = as_retroformer(parse_config(default=CONFIGS / "retroformer_cpu.yaml"))
     trainer = train(config, trainer_class=RetroformerTrainer, load=load_actor_and_reflector)
     trainer.accelerator.wait_for_everyone()
     if not trainer.accelerator.is_main_process:
@@ -35,7 +37,7 @@ def main() -> None:
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     """Two trials of every held-out task with either reflector: rows, also in ``folder`` with their table."""
     from agentspec.episode import Job, Runner
-    from agentspec.state import write_atomic
+    from agentspec.files import write_atomic
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import has_lesson, play_trials, routed_llm
     from trainers.rollouts import make_tasks

@@ -2,7 +2,7 @@
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
 
-The adapter in ``trainers/adapters/smollm2-135m-courier`` was made with this command. TRL's ``SFTTrainer`` trains on
+The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's ``SFTTrainer`` trains on
 the tokens the expert chose; prompts and observations are context.
 """
 
@@ -11,13 +11,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from recipes.common import parse_config, run_config, run_recipe
+from recipes.common import CONFIGS, run_recipe
 
 
 def main() -> None:
     """Demonstrate, train, save the adapter."""
-    config = parse_config(default="warmup_cpu.yaml")
-    train_warmup(config)
+    from trainers.arguments import parse_config
+
+    train_warmup(parse_config(default=CONFIGS / "warmup_cpu.yaml"))
 
 
 def train_warmup(config: Any) -> None:
@@ -25,6 +26,9 @@ def train_warmup(config: Any) -> None:
     from datasets import Dataset
     from trl import SFTConfig
 
+    from agentspec.files import write_atomic
+    from trainers.card import model_card
+    from trainers.config import CHECKPOINTING
     from trainers.demonstrations import DemonstrationTrainer, demonstrate
     from trainers.policy import load_policy
     from trainers.rollouts import make_tasks
@@ -50,15 +54,17 @@ def train_warmup(config: Any) -> None:
         report_to=config.report_to,
         use_cpu=config.use_cpu,
         bf16=config.bf16,
-        gradient_checkpointing=config.gradient_checkpointing,
+        **{CHECKPOINTING: getattr(config, CHECKPOINTING)},
         seed=config.seed,
     )
     data = Dataset.from_list(shown.rows)
     trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()
     trainer.save_model(config.output_dir)
+    card = model_card(Path(config.output_dir).name, vars(config), config.spec.to_data(), adapter=bool(config.lora_r))
+    write_atomic(Path(config.output_dir) / "README.md", card)
     log = RunLog(Path(config.output_dir))
-    log.manifest(config=run_config(config), spec=config.spec.to_data(), demonstrations=len(returns))
+    log.manifest(config=config.to_dict(), spec=config.spec.to_data(), demonstrations=len(returns))
 
 
 if __name__ == "__main__":

@@ -8,14 +8,16 @@ and the summary's tokens are trained with the rollout's advantage.
 
 from __future__ import annotations
 
-from recipes.common import draw_curve, parse_config, run_recipe, train
+from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
     """Train with summaries, save the adapter, draw the reward curve."""
+    from trainers.arguments import parse_config
+    from trainers.run import train
     from trainers.supo import as_supo
 
-    config = as_supo(parse_config(default="supo_cpu.yaml"))
+    config = as_supo(parse_config(default=CONFIGS / "supo_cpu.yaml"))
     draw_curve(config, train(config))
 
 

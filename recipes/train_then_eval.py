@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recipes.common import draw_curve, parse_config, run_recipe, train
+from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
     """Train, draw the reward curve, evaluate, write ``evaluation.md`` and ``evaluation.jsonl``."""
-    config = parse_config()
+    from trainers.arguments import parse_config
+    from trainers.run import train
+
+    config = parse_config(default=CONFIGS / "quickstart_cpu.yaml")
     trainer = train(config)
     trainer.accelerator.wait_for_everyone()
     if not trainer.accelerator.is_main_process:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ast
+import io
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tokenize import COMMENT
+from tokenize import generate_tokens as tokenize
 
 import pytest
 
@@ -50,6 +54,24 @@ def offences(package: str, forbidden: set[str], *, anywhere: bool, skip: str = "
 
 def test_the_scaffold_never_imports_what_is_built_on_it() -> None:
     assert offences("agentspec", UPPER, anywhere=True, skip="agentspec/cli/") == []
+
+
+def test_the_scaffold_does_not_name_what_is_built_on_it_even_in_words() -> None:
+    """A string can be imported too, and a docstring that explains one layer by another ties them together."""
+    path_to = re.compile(rf"(?<![\w./-])(?:{'|'.join(sorted(UPPER))})[./]\w")
+    found = []
+    for path in sources("agentspec"):
+        where = path.relative_to(ROOT).as_posix()
+        if where.startswith("agentspec/cli/"):
+            continue
+        source = path.read_text(encoding="utf-8")
+        words = [
+            n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant) and isinstance(n.value, str)
+        ]
+        found += [f"{where}: {name!r}" for name in words if name in UPPER - {"eval"}]  # `ast.parse(mode="eval")`
+        words += [t.string for t in tokenize(io.StringIO(source).readline) if t.type == COMMENT]
+        found += [f"{where}: {match.group()}" for text in words for match in path_to.finditer(text)]
+    assert found == []
 
 
 def test_the_command_line_imports_the_rest_only_inside_its_commands() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,22 @@ import pytest
 
 pytest.importorskip("trl")
 
+from trl import GRPOConfig
+
 from agentspec.registry import SpecError
-from recipes.common import CONFIGS, parse_config, run_recipe, train
-from trainers.resume import last_complete_checkpoint
+from recipes.common import CONFIGS, run_recipe
+from trainers.arguments import OURS, merged, parse_config, read_config
+from trainers.checks import notes
+from trainers.config import ScaffoldConfig
+from trainers.run import train
+from trainers.run_folder import last_complete_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
-ON_CPU = ["--use_cpu", "true", "--bf16", "false"]
+ON_CPU = ["--use_cpu", "true", "--bf16", "false", "--report_to", "none"]
 
 
 def parsed(name: str, *overrides: str) -> Any:
-    config = parse_config(["--config", str(CONFIGS / name), *overrides])
+    config = parse_config(["--config", str(CONFIGS / name), *overrides], default="none.yaml")
     config.check()
     return config
 
@@ -38,10 +46,10 @@ def test_the_quick_start(tmp_path: Path) -> None:
     config = parsed("quickstart_cpu.yaml")
     assert config.model == "smollm2-135m" and config.adapter and config.use_cpu
     assert config.rewards == {"earning_delta": 1.0} and config.loss_type in ("dapo", "cispo")
-    assert config.warnings() == []
+    assert notes(config) == []
     # Whole groups, of rollouts that are compared with each other.
     assert rollouts_per_update(config) % config.num_generations == 0
-    assert parse_config([]).output_dir == config.output_dir  # it is the default
+    assert parse_config([], default=CONFIGS / "quickstart_cpu.yaml").output_dir == config.output_dir
 
 
 def rollouts_per_update(config: Any) -> int:
@@ -65,6 +73,94 @@ def test_the_paper_s_setting() -> None:
 def test_overrides_win_and_structures_can_be_given() -> None:
     config = parsed("quickstart_cpu.yaml", "--max_steps", "7", "--agent", '{"reasoning": "react"}')
     assert config.max_steps == 7 and config.spec.reasoning.name == "react"
+
+
+# --- one file extends another ----------------------------------------------------------------------------------------
+
+
+def write_yaml(folder: Path, **files: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.yaml").write_text(text)
+    return folder
+
+
+def test_a_file_extends_another_one_beside_it(tmp_path: Path) -> None:
+    deep = write_yaml(tmp_path, base="learning_rate: 0.5\nmax_steps: 3\nrewards: {success: 1.0, earning_delta: 2.0}\n")
+    folder = write_yaml(
+        deep / "below",
+        middle="extends: ../base.yaml\nmax_steps: 4\nagent: {reasoning: react, memory: {name: base, window: 3}}\n",
+        top="extends: middle.yaml\nrewards: {success: null}\nagent: {memory: {window: 9}}\neval_specs: [{}]\n",
+    )
+    assert read_config(folder / "top.yaml") == {
+        "learning_rate": 0.5,
+        "max_steps": 4,
+        "rewards": {"earning_delta": 2.0},
+        "agent": {"reasoning": "react", "memory": {"name": "base", "window": 9}},
+        "eval_specs": [{}],
+    }
+    config = parse_config(["--max_steps", "7", *ON_CPU], default=folder / "top.yaml")
+    assert (config.max_steps, config.learning_rate, config.rewards) == (7, 0.5, {"earning_delta": 2.0})
+
+
+def test_another_module_brings_its_own_parameters() -> None:
+    base = {"agent": {"memory": {"name": "summary", "every": 8}, "layout": "snapshot"}}
+    assert merged(base, {"agent": {"memory": {"name": "base"}}}) == {
+        "agent": {"memory": {"name": "base"}, "layout": "snapshot"}
+    }
+    assert merged(base, {"agent": {"memory": {"name": "summary", "every": 4}}})["agent"]["memory"]["every"] == 4
+    assert merged(base, {"agent": {"memory": "none"}})["agent"]["memory"] == "none"
+    assert base["agent"]["memory"] == {"name": "summary", "every": 8}  # is left as it was
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"top": "extends: top.yaml\n"}, "cannot extend itself"),
+        ({"top": "extends: a.yaml\n", "a": "extends: top.yaml\n"}, "cannot extend itself"),
+        ({"top": "extends: none.yaml\n"}, "no such YAML file"),
+        ({"top": "extends: [a.yaml]\n", "a": ""}, "expected the path of one YAML file"),
+        ({"top": "extends: a.yaml\n", "a": "learning_rte: 1\n"}, "did you mean learning_rate"),
+        ({"top": "- 1\n"}, "expected a mapping"),
+    ],
+)
+def test_what_cannot_be_extended(tmp_path: Path, files: dict[str, str], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        read_config(write_yaml(tmp_path, **files) / "top.yaml")
+
+
+# --- the command line ------------------------------------------------------------------------------------------------
+
+
+def test_options_are_never_abbreviated(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="--learning_rat"):
+        parse_config(["--learning_rat", "1", *ON_CPU], default=CONFIGS / "quickstart_cpu.yaml")
+    assert parse_config(["--learning_rate", "1", *ON_CPU], default=CONFIGS / "cpu.yaml").learning_rate == 1
+
+
+def test_no_parser_of_the_project_takes_abbreviations() -> None:
+    calls = []
+    for folder in ("agentspec", "trainers", "recipes", "eval", "benchmarks", "docs"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("ArgumentParser"):
+                    calls.append(path)
+                    settings = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                    assert settings.get("allow_abbrev") == "False", f"{path}:{node.lineno}"
+    assert len(calls) > 5
+
+
+def test_help_begins_with_what_is_ours(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        parse_config(["--help"], default=CONFIGS / "quickstart_cpu.yaml")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    places = [text.index(f"\n{heading}:") for heading in (*OURS, "TRL: loss", "TRL: vLLM")]
+    assert places == sorted(places) and text.index("--config FILE") < places[0]
+    assert {f.name for f in fields(ScaffoldConfig)} - {f.name for f in fields(GRPOConfig)} == {
+        name for names in OURS.values() for name in names.split()
+    }
+    assert "--temperature" not in text and "--learning_rate" in text  # what is refused is not offered
 
 
 # --- mistakes --------------------------------------------------------------------------------------------------------
@@ -96,7 +192,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(
     text, expected = MISTAKES[mistake]
     path = written(tmp_path, text)
     with pytest.raises(SystemExit) as caught:
-        run_recipe(lambda: train(parse_config(["--config", path])))
+        run_recipe(lambda: train(parse_config(["--config", path], default="")))
     assert caught.value.code == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and expected in err and "Traceback" not in err, err
@@ -104,7 +200,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(
 
 def test_a_missing_config_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        run_recipe(lambda: parse_config(["--config", str(tmp_path / "none.yaml")]))
+        run_recipe(lambda: parse_config(["--config", str(tmp_path / "none.yaml")], default=""))
     assert caught.value.code == 2
     assert "none.yaml" in capsys.readouterr().err
 
@@ -120,7 +216,7 @@ def test_a_recipe_says_no_as_a_program(tmp_path: Path) -> None:
 
 def test_a_config_without_value_for_config_is_refused() -> None:
     with pytest.raises(SpecError, match="--config"):
-        parse_config(["--config"])
+        parse_config(["--config"], default="")
 
 
 # --- which checkpoint a run resumes from -----------------------------------------------------------------------------

@@ -18,15 +18,10 @@ from trainers.sequences import Row, TrainFilter
 
 @dataclass
 class CallTotals:
-    """Sums over the trained tokens of one path.
-
-    ``computed`` counts those the update's forward saw: all but those of rows without a gradient, which it may leave
-    out. ``entropy`` (nats) and ``clipped`` are sums over these.
-    """
+    """Sums over the trained tokens of one path; `entropy` in nats."""
 
     tokens: int = 0
     advantage: float = 0.0
-    computed: int = 0
     entropy: float = 0.0
     clipped: int = 0
 
@@ -41,27 +36,24 @@ class CallMetrics:
     def __init__(self) -> None:
         self._totals: dict[str, CallTotals] = {}
 
-    def add(self, rows: Sequence[Row], entropies: torch.Tensor, clipped: torch.Tensor, computed: torch.Tensor) -> None:
+    def add(self, rows: Sequence[Row], entropies: torch.Tensor, clipped: torch.Tensor) -> None:
         """Count one micro-batch.
 
         Args:
-            entropies: (B, L-1), nats, aligned with ``completion_ids``.
+            entropies: (B, L-1), nats, aligned with `completion_ids`.
             clipped: (B, L-1), whether the loss clipped the token's ratio.
-            computed: (B, L-1), whether the forward computed the token.
         """
-        for row, entropy, cut, seen in zip(rows, entropies.tolist(), clipped.tolist(), computed.tolist(), strict=True):
+        for row, entropy, cut in zip(rows, entropies.tolist(), clipped.tolist(), strict=True):
             sequence = row.sequence
             for place, trained in enumerate(sequence.mask):
                 if not trained:
                     continue
                 totals = self._totals.setdefault(sequence.paths[sequence.calls[place]], CallTotals())
-                weight = row.advantage if isinstance(row.advantage, int | float) else row.advantage[place]
+                advantage = row.advantage if isinstance(row.advantage, int | float) else row.advantage[place]
                 totals.tokens += 1
-                totals.advantage += abs(weight)
-                if seen[place - 1]:
-                    totals.computed += 1
-                    totals.entropy += entropy[place - 1]
-                    totals.clipped += bool(cut[place - 1])
+                totals.advantage += abs(advantage)
+                totals.entropy += entropy[place - 1]
+                totals.clipped += bool(cut[place - 1])
 
     def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
         """Metrics of what was counted since the last time, over all ranks.
@@ -78,25 +70,9 @@ class CallMetrics:
         for path, t in sorted(everywhere.items()):
             metrics[f"calls/{path}/tokens"] = float(t.tokens)
             metrics[f"calls/{path}/advantage_mass"] = t.advantage / mass if mass else 0.0
-            if t.computed:
-                metrics[f"calls/{path}/entropy"] = t.entropy / t.computed
-                metrics[f"calls/{path}/clip_share"] = t.clipped / t.computed
+            metrics[f"calls/{path}/entropy"] = t.entropy / t.tokens
+            metrics[f"calls/{path}/clip_share"] = t.clipped / t.tokens
         return metrics
-
-
-def clipped_tokens(
-    ratios: torch.Tensor, advantages: torch.Tensor, loss_type: str, low: float, high: float
-) -> torch.Tensor:
-    """Where the loss clips: bool of the shape of ``ratios``; ``advantages`` (B,) or of that shape.
-
-    As in TRL: cispo caps the ratio at ``high`` where the advantage is positive; the others stop the gradient of a ratio
-    outside [1 - low, 1 + high] on the side the advantage pushes to.
-    """
-    if advantages.dim() < ratios.dim():
-        advantages = advantages.unsqueeze(-1)
-    if loss_type == "cispo":
-        return (ratios > high) & (advantages > 0)
-    return ((ratios < 1 - low) & (advantages < 0)) | ((ratios > 1 + high) & (advantages > 0))
 
 
 def truncated_calls(episodes: Sequence[Trajectory], train: TrainFilter) -> dict[str, float]:

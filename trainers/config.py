@@ -1,7 +1,7 @@
 """The configuration of a run: TRL's ``GRPOConfig`` plus what the scaffold adds, in one dataclass.
 
-``TrlParser`` fills it from a YAML file and from the command line; no other class mirrors it. ``check`` refuses at start
-what cannot work or would not be exact, with the reason and the remedy.
+`trainers.arguments` fills it from a YAML file and from the command line; no other class mirrors it. What cannot work
+or would not be exact is refused at start, with the reason and the remedy (`trainers.checks`).
 """
 
 from __future__ import annotations
@@ -9,36 +9,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any
 
 from trl import GRPOConfig
 
-from agentspec.actions import suggest
-from agentspec.llm.batching import Batching
-from agentspec.registry import REGISTRY, SpecError
-from agentspec.spec import MODULE_KINDS, AgentSpec, load_yaml
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
 from rewards import RewardSet
+from trainers.checks import check
 from trainers.estimators import ESTIMATORS
-from trainers.sequences import TrainFilter, unmatched_patterns
-from trainers.vllm import check_vllm
+from trainers.sequences import TrainFilter
 
-EXACT_LOSSES = ("dapo", "cispo")
-"""Loss types normalised by all trained tokens of the update: the same objective however many rows an episode has."""
-
-ROW_LOSSES = {
-    "grpo": "each row weighs the same, so an episode of three rows weighs three times one of a single row",
-    "bnpo": "each micro-batch is normalised by its own tokens, so the weights depend on how rows were dealt",
-    "dr_grpo": "the sum is divided by rows x max_completion_length, so the scale falls as rows per episode grow",
-}
-"""Loss types that depend on how episodes split into rows, and how."""
-
-ENDS = ("context", "budget", "max_steps", "truncated")
-
-REFUSED_LOSSES = {
-    "luspo": "it sums per row, so an episode counts once per row",
-    "sapo": "it averages per row and has no test against stock TRL here",
-    "vespo": "its weights are products over one row, not over the episode",
-}
+CHECKPOINTING = (
+    "activation_checkpointing" if hasattr(GRPOConfig, "activation_checkpointing") else "gradient_checkpointing"
+)
+"""What the installed transformers calls recomputing activations; it warns of the older name."""
 
 
 @dataclass
@@ -57,6 +42,8 @@ class ScaffoldConfig(GRPOConfig):
         train_calls: patterns over ``module/purpose`` of the calls that are trained.
         train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
         rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
+        reference: with ``beta`` above 0, what the policy is kept near: the ``initial`` policy, as training began (its
+            adapter included), or the ``base`` model without any adapter.
         estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
@@ -72,8 +59,9 @@ class ScaffoldConfig(GRPOConfig):
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: ``ordered`` and ``closed`` repeat to the
-            last bit, ``eager`` waits for nobody, ``auto`` does so where it repeats (:mod:`agentspec.llm.batching`).
+        batching: when the local backend takes requests into a running batch: ``continuous`` at any time, ``closed``
+            never, so that runs repeat on every device; ``auto`` is ``continuous`` where that repeats to the last bit
+            (a CPU in float32), else ``closed``, with a warning (`agentspec.llm.batching`).
         packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
@@ -84,6 +72,8 @@ class ScaffoldConfig(GRPOConfig):
         vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
             trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
             (``token_mask``); both need ``vllm_importance_sampling_correction``.
+        vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
+            runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
@@ -106,6 +96,7 @@ class ScaffoldConfig(GRPOConfig):
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
     rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
     estimator: str = field(default="grpo", metadata={"help": ", ".join(ESTIMATORS)})
+    reference: str = field(default="initial", metadata={"help": "initial or base; with beta above 0"})
     gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
     gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
     skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
@@ -117,7 +108,7 @@ class ScaffoldConfig(GRPOConfig):
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    batching: str = field(default="auto", metadata={"help": "auto, ordered, closed or eager"})
+    batching: str = field(default="auto", metadata={"help": "auto, continuous or closed"})
     packing: str = field(default="tree", metadata={"help": "tree or padded"})
     tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
     lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
@@ -128,6 +119,7 @@ class ScaffoldConfig(GRPOConfig):
     vllm_importance_sampling_mode: str = field(
         default="token_truncate", metadata={"help": "token_truncate or token_mask"}
     )
+    vllm_batch_invariant: bool = field(default=False, metadata={"help": "vLLM's batch-invariant mode"})
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})
@@ -145,6 +137,8 @@ class ScaffoldConfig(GRPOConfig):
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
         if getattr(self, "bf16", None) is None and self.use_cpu:
             self.bf16 = False  # TRL's default would round log-probabilities to 16 bits, and is slower on a CPU
+        if hasattr(self, CHECKPOINTING) and getattr(self, CHECKPOINTING) is None:
+            setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
         super().__post_init__()
 
     @property
@@ -199,113 +193,12 @@ class ScaffoldConfig(GRPOConfig):
         return RewardSet(self.rewards)
 
     def check(self) -> None:
-        """Refuse what cannot work or would not be exact.
+        """Refuse what cannot work, would not be exact, or would change nothing (`trainers.checks`).
 
         Raises:
             SpecError: what was given, why it cannot work, what to do.
         """
-        _ = self.reward_set, self.world
-        self._check_names()
-        self._check_calls()
-        self._check_exact()
-        check_vllm(self)
-
-    def _check_names(self) -> None:
-        """Every name among its alternatives."""
-        for name, known in (
-            ("estimator", tuple(ESTIMATORS)),
-            ("normalize", ("token", "rollout")),
-            ("overlong", ("mask", "keep", "drop")),
-            ("memory_carry", ("first", "best")),
-            ("packing", ("tree", "padded")),
-            ("batching", ("auto", *get_args(Batching))),
-        ):
-            value = getattr(self, name)
-            if value not in known:
-                raise SpecError(f"unknown {name} {value!r}{suggest(value, known)}")
-        for name, known in (("overlong_ends", ENDS), ("train_credits", ("executed", "explored", "aux"))):
-            for value in getattr(self, name):
-                if value not in known:
-                    raise SpecError(f"unknown {value!r} in {name}{suggest(value, known)}")
-
-    def _check_calls(self) -> None:
-        """Something is trained, and sampled so that it can be."""
-        spec = self.spec
-        paths = call_paths(spec)
-        missing = unmatched_patterns(paths, self.train_filter)
-        if missing:
-            raise SpecError(
-                f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
-                f"come from {', '.join(sorted(set(paths))) or 'no module (none calls the model)'}"
-            )
-        if self.actor_temperature < 0:
-            raise SpecError(f"actor_temperature is {self.actor_temperature}; expected 0 (greedy) or above")
-        if spec.sampling.temperature <= 0:
-            raise SpecError("agent.sampling.temperature is 0: greedy choices have no gradient; set it above 0")
-        if spec.sampling.top_p < 1 or spec.sampling.top_k > 0:
-            raise SpecError(
-                "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full "
-                "distribution and would not match the sampled ones; train with top_p 1 and top_k 0"
-            )
-
-    def _check_exact(self) -> None:
-        """Nothing of TRL's that speaks of rows where this trainer speaks of episodes."""
-        if self.loss_type in REFUSED_LOSSES:
-            raise SpecError(
-                f"loss_type {self.loss_type!r} is not offered: {REFUSED_LOSSES[self.loss_type]}; "
-                f"use one of {', '.join((*EXACT_LOSSES, *ROW_LOSSES))}"
-            )
-        for name, wanted in (
-            ("mask_truncated_completions", False),
-            ("multi_objective_aggregation", "sum_then_normalize"),
-            ("importance_sampling_level", "token"),
-            ("scale_rewards", "group"),
-        ):
-            if getattr(self, name) != wanted:
-                raise SpecError(
-                    f"{name}={getattr(self, name)!r} speaks of rows, not of episodes, and is not offered; leave it at "
-                    f"{wanted!r} (advantages are chosen by `estimator`)"
-                )
-        if self.normalize == "rollout" and self.loss_type not in EXACT_LOSSES:
-            raise SpecError(
-                f"normalize 'rollout' with loss_type {self.loss_type!r}: its denominator is not the number of trained "
-                f"tokens; use one of {', '.join(EXACT_LOSSES)}"
-            )
-        self._check_validation()
-        if self.num_generations < 2:
-            raise SpecError(f"num_generations is {self.num_generations}: a group needs at least 2 rollouts to compare")
-
-    def _check_validation(self) -> None:
-        """A checkpoint exists of whatever update turns out best."""
-        _ = self.other_specs
-        if not self.validates:
-            return
-        if self.validation_tasks < 1:
-            raise SpecError(f"validation_tasks is {self.validation_tasks}: evaluation while training needs at least 1")
-        saves = getattr(self.save_strategy, "value", self.save_strategy)
-        if saves == "steps" and self.eval_strategy == "steps" and (self.eval_steps or 0) % self.save_steps:
-            raise SpecError(
-                f"eval_steps {self.eval_steps} is no multiple of save_steps {self.save_steps}, so the best update may "
-                "have no checkpoint; make it one, or set `save_strategy: best`"
-            )
-
-    def warnings(self) -> list[str]:
-        """What a user should know about a configuration that runs."""
-        notes = []
-        if self.loss_type in ROW_LOSSES:
-            notes.append(f"loss_type {self.loss_type}: {ROW_LOSSES[self.loss_type]}; 'dapo' does not depend on rows")
-        return notes
-
-
-def call_paths(spec: AgentSpec) -> list[str]:
-    """``module/...`` paths of the modules that may call the model, for checking patterns before a run."""
-    paths = []
-    for kind in MODULE_KINDS:
-        module = getattr(spec, kind)
-        entry = REGISTRY.get(kind, module.name)
-        if entry.calls.calls_model:
-            paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
-    return paths
+        check(self)
 
 
 def agent_spec(value: Any) -> AgentSpec:
@@ -327,6 +220,3 @@ def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:
     except ValueError as error:
         raise SpecError(f"{name}: not valid JSON ({error}); quote keys and strings with double quotes") from error
     return data
-
-
-__all__ = ["EXACT_LOSSES", "REFUSED_LOSSES", "ROW_LOSSES", "ScaffoldConfig", "agent_spec", "call_paths", "load_yaml"]

@@ -20,7 +20,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from trainers.batches import rows_logprobs
+from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence, TrainFilter, build_sequences
 from trainers.tree import enable_tree
 

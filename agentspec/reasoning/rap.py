@@ -163,6 +163,10 @@ class ReasoningViaPlanning(Stateless):
         purposes=Purpose.each("step", "propose", "world", "judge"),
         needs=("n", "score"),
         waived={"score": ("evaluation", "samples")},
+        small=(
+            {"preset": "rl", "evaluation": "samples", "output": "max_visits"},
+            {"preset": "rl", "output": "max_iter"},
+        ),
     )
 
     def __init__(

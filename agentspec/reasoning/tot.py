@@ -119,6 +119,10 @@ class TreeOfThoughts(Stateless):
         calls=CallProfile(step=(1, 22)),
         rl=CallProfile(step=(1, 10)),
         purposes=Purpose.each("step", "propose", "value", "vote"),
+        small=(
+            {"preset": "rl", "search_strategy": "DFS"},
+            {"preset": "rl", "evaluation_strategy": "vote", "selection": "sample"},
+        ),
         needs=("n",),
     )
 

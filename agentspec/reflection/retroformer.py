@@ -12,7 +12,7 @@ followed by a trial of their own, so their rewards compare like with like.
 
 `when` says in which of the two trials the lesson is written: at the `end` of the failed one, or at the `start` of
 the next. What the reflector reads is the same. With `start` a lesson and the trial that pays it are one episode, so
-that many lessons can be drawn from the memory that one failed trial left: `trainers.retroformer` trains on these.
+that many lessons can be drawn from the memory that one failed trial left: a trainer may learn from these.
 
 The reflector reads the actions on offer, the fullest view of the trial (the pool of orders, say), and the thought
 behind each step. `control` puts a fixed text in the place of every lesson: a meaningless one is what a trained
@@ -95,6 +95,8 @@ class Retroformer(Reflexion):
         calls=CallProfile(episode=(0, 1)),
         scope="run",
         purposes={"reflect": Purpose("episode")},
+        small=({"when": "start"},),
+        small_calls=CallProfile(retrieve=(0, 1)),
     )
 
     name = "retroformer"

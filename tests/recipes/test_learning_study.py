@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("trl")
 
 from agentspec.registry import SpecError
-from recipes.common import CONFIGS, parse_config
+from recipes.common import CONFIGS
 from recipes.learning_study import check, gains
+from trainers.arguments import parse_config
 
 
 def rows(policy: str, scaffold: str, values: list[float]) -> list[dict[str, object]]:
@@ -52,7 +53,7 @@ def test_a_task_that_failed_for_one_run_counts_for_none() -> None:
 
 
 def test_the_shipped_study_compares_like_with_like() -> None:
-    grpo, supo = (parse_config(["--config", str(CONFIGS / f"study_{name}.yaml")]) for name in ("grpo", "supo"))
+    grpo, supo = (parse_config([], default=CONFIGS / f"study_{name}.yaml") for name in ("grpo", "supo"))
     grpo.check()
     supo.check()
     check({"grpo": grpo, "supo": supo})

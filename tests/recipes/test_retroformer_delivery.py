@@ -14,10 +14,11 @@ pytest.importorskip("peft")
 
 from safetensors.torch import load_file
 
-from recipes.common import CONFIGS, parse_config
+from recipes.common import CONFIGS
 from recipes.retroformer_delivery import main, markdown
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
+from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.retroformer import as_retroformer
 
@@ -88,7 +89,7 @@ def test_the_table_is_derived_by_hand() -> None:
 
 def test_the_shipped_configuration_trains_a_reflector(tmp_path: Path) -> None:
     path = str(CONFIGS / "retroformer_cpu.yaml")
-    config = as_retroformer(parse_config(["--config", path, "--output_dir", str(tmp_path), *ON_CPU]))
+    config = as_retroformer(parse_config(["--output_dir", str(tmp_path), *ON_CPU], default=path))
     config.check()
     assert config.train_calls == ["reflection.retroformer/reflect"] and config.spec.scope == "run"
     assert config.actor_adapter == "smollm2-135m-courier" and config.actor_temperature == 0.0

@@ -12,9 +12,8 @@ pytest.importorskip("trl")
 
 from tests.trainers.builders import call, episode
 from tests.trainers.test_resume import trainer
-from trainers.batches import collate
-from trainers.call_metrics import CallMetrics, clipped_tokens
-from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.call_metrics import CallMetrics
+from trainers.micro_batches import collate
 from trainers.runlog import RunLog
 from trainers.sequences import Row, TrainFilter, build_sequences
 
@@ -39,7 +38,7 @@ def test_exact_numbers() -> None:
     clipped = torch.zeros(2, 6, dtype=torch.bool)
     clipped[0, 1] = True  # the first trained token of the first row stands at position 2
     metrics = CallMetrics()
-    metrics.add(rows(), entropies, clipped, computed)
+    metrics.add(rows(), entropies, clipped)
     got = metrics.flush()
     assert got[f"calls/{ACT}/tokens"] == 4 and got[f"calls/{SUM}/tokens"] == 1
     assert got[f"calls/{ACT}/advantage_mass"] == pytest.approx(2.0 / 5.0)
@@ -51,37 +50,18 @@ def test_exact_numbers() -> None:
 
 
 def test_ranks_are_added_up() -> None:
-    batch = collate(rows(), pad=0)
     nothing = torch.zeros(2, 6)
     alone, first, second = CallMetrics(), CallMetrics(), CallMetrics()
     for metrics, parts in ((alone, rows() + rows()), (first, rows()), (second, rows())):
         for start in range(0, len(parts), 2):
-            metrics.add(parts[start : start + 2], nothing, nothing.bool(), batch["tool_mask"])
+            metrics.add(parts[start : start + 2], nothing, nothing.bool())
     other: list[Any] = []
     second.flush(lambda local: other.extend(local) or [])  # type: ignore[func-returns-value]
     assert first.flush(lambda local: local + other) == alone.flush()
 
 
-def test_tokens_that_the_forward_left_out_have_no_entropy() -> None:
-    silent = [Row(r.sequence, 0.0, 0) for r in rows()]
-    batch = collate(silent, pad=0, skip_silent=True)
-    metrics = CallMetrics()
-    metrics.add(silent, torch.zeros(2, 6), torch.zeros(2, 6, dtype=torch.bool), batch["tool_mask"])
-    got = metrics.flush()
-    assert got[f"calls/{ACT}/tokens"] == 4 and got[f"calls/{ACT}/advantage_mass"] == 0.0
-    assert f"calls/{ACT}/entropy" not in got
-
-
-def test_what_is_clipped() -> None:
-    ratios = torch.tensor([[0.7, 1.0, 1.3], [0.7, 1.0, 1.3]])
-    advantages = torch.tensor([1.0, -1.0])
-    assert clipped_tokens(ratios, advantages, "dapo", 0.2, 0.2).tolist() == [[False, False, True], [True, False, False]]
-    assert clipped_tokens(ratios, advantages, "cispo", 0.2, 1.2).tolist() == [[False, False, True], [False] * 3]
-
-
-def test_they_agree_with_the_whole_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_they_agree_with_the_whole_update(tmp_path: Path) -> None:
     """Token-weighted means over the paths are TRL's figures for the update; several iterations make ratios move."""
-    monkeypatch.setattr(ScaffoldGRPOTrainer, "_skip_silent", False)  # every trained token is computed
     run = trainer(
         tmp_path,
         agent={"reasoning": "direct", "memory": {"name": "summary", "every": 2, "summary_tokens": 6}},

@@ -6,6 +6,8 @@ Episodes are prebuilt (random tokens), so that stock TRL and this trainer see ex
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ import torch
 pytest.importorskip("trl")
 
 from datasets import Dataset
+from peft import LoraConfig, get_peft_model
 from transformers import TrainerCallback
 from trl import GRPOConfig, GRPOTrainer
 
@@ -24,9 +27,11 @@ from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.trainers.builders import call, episode, instead_of_playing
 from trainers import grpo as grpo_module
-from trainers.batches import collate, rows_logprobs
 from trainers.config import ScaffoldConfig
+from trainers.forward import rows_logprobs
 from trainers.grpo import ScaffoldGRPOTrainer
+from trainers.losses import LOSSES
+from trainers.micro_batches import collate
 from trainers.rollouts import task_rows
 from trainers.sequences import Row, build_sequences
 
@@ -66,7 +71,7 @@ def settings(tmp_path: Any, **changes: Any) -> dict[str, Any]:
         "save_strategy": "no",
         "logging_steps": 1,
         "disable_tqdm": True,
-        "max_completion_length": 40,
+        **({"max_completion_length": 40} if changes.get("loss_type") == "dr_grpo" else {}),
         "shuffle_dataset": False,
         **changes,
     }
@@ -95,18 +100,53 @@ def spied(trainer: GRPOTrainer) -> GradientSpy:
     return spy
 
 
-def ours(tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any = None, **changes: Any) -> GradientSpy:
+def our_trainer(
+    tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any = None, **changes: Any
+) -> ScaffoldGRPOTrainer:
+    """This trainer, playing given episodes."""
     tokenizer = tiny_tokenizer()
     tasks = task_rows([Task("toy", i) for i in range(GROUPS)])
-    trainer = ScaffoldGRPOTrainer(
+    monkeypatch.setattr(grpo_module, "collect", instead_of_playing(lambda jobs: episodes))
+    return ScaffoldGRPOTrainer(
         model or tiny_model(tokenizer),
         ScaffoldConfig(**settings(tmp_path, **changes)),
         train_dataset=Dataset.from_list(tasks),
         processing_class=tokenizer,
         make_llm=lambda model, tokenizer: object.__new__(type("Unused", (LLM,), {})),
     )
-    monkeypatch.setattr(grpo_module, "collect", instead_of_playing(lambda jobs: episodes))
-    return spied(trainer)
+
+
+def ours(tmp_path: Any, episodes: list[Trajectory], monkeypatch: Any, model: Any = None, **changes: Any) -> GradientSpy:
+    return spied(our_trainer(tmp_path, episodes, monkeypatch, model, **changes))
+
+
+def stock_trainer(tmp_path: Any, episodes: list[Trajectory], model: Any = None, **changes: Any) -> GRPOTrainer:
+    """TRL's own trainer on the same tokens and returns; every episode is one sequence."""
+    sequences = [s for e in episodes for s in build_sequences(e)]
+    assert len(sequences) == len(episodes)
+    prompts = [s.mask.index(1) for s in sequences]  # lengths: what comes before the first trained token
+
+    def rollout_func(_: list[Any], trainer: Any) -> dict[str, Any]:
+        return {
+            "prompt_ids": [s.tokens[:n] for s, n in zip(sequences, prompts, strict=True)],
+            "completion_ids": [s.tokens[n:] for s, n in zip(sequences, prompts, strict=True)],
+            "env_mask": [s.mask[n:] for s, n in zip(sequences, prompts, strict=True)],
+            "logprobs": [s.logprobs[n:] for s, n in zip(sequences, prompts, strict=True)],
+            "value": [sum(t.reward for t in e.transitions) for e in episodes],
+        }
+
+    def earning_delta(value: list[float], **_: Any) -> list[float]:
+        return value
+
+    tokenizer = tiny_tokenizer()
+    return GRPOTrainer(
+        model or tiny_model(tokenizer),
+        reward_funcs=earning_delta,
+        args=GRPOConfig(**settings(tmp_path, **changes)),
+        train_dataset=Dataset.from_list([{"prompt": str(i)} for i in range(GROUPS)]),
+        processing_class=tokenizer,
+        rollout_func=rollout_func,
+    )
 
 
 def relative_difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
@@ -115,34 +155,99 @@ def relative_difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) 
     return difference / math.sqrt(sum(g.square().sum().item() for g in b.values()))
 
 
-@pytest.mark.parametrize("loss_type", ["dapo", "cispo", "grpo", "dr_grpo", "bnpo"])
-def test_single_sequence_work_equals_stock_trl(tmp_path: Any, monkeypatch: Any, loss_type: str) -> None:
-    episodes = [episode(random_calls(i, turns=3), [0.0, 0.0, r], rollout=i % 4) for i, r in enumerate(RETURNS)]
-    # bnpo normalises each micro-batch by its own tokens: only one micro-batch makes the comparison well defined.
-    one = {"per_device_train_batch_size": 8, "gradient_accumulation_steps": 1} if loss_type == "bnpo" else {}
-    spy = ours(tmp_path / "ours", episodes, monkeypatch, loss_type=loss_type, **one)
+# Group 0 has no variance; in group 1 two rollouts stand at the mean (1, 0, .5, .5: mean .5).
+ZERO_ADVANTAGES = [3.0, 3.0, 3.0, 3.0, 1.0, 0.0, 0.5, 0.5]
+ONE_MICRO_BATCH = {"per_device_train_batch_size": 8, "gradient_accumulation_steps": 1}
+# What looks at one micro-batch at a time can be compared only where there is one.
+CASES: list[dict[str, Any]] = [{"loss_type": name} for name, spec in LOSSES.items() if spec.trl and name != "bnpo"]
+CASES += [ONE_MICRO_BATCH | {"loss_type": "bnpo"}, ONE_MICRO_BATCH | {"top_entropy_quantile": 0.5}]
 
-    sequences = [build_sequences(e)[0] for e in episodes]
 
-    def rollout_func(prompts: list[Any], trainer: Any) -> dict[str, Any]:
-        return {
-            "prompt_ids": [s.tokens[:1] for s in sequences],
-            "completion_ids": [s.tokens[1:] for s in sequences],
-            "env_mask": [s.mask[1:] for s in sequences],
-            "logprobs": [s.logprobs[1:] for s in sequences],
-            "value": RETURNS,
-        }
+def conversations(returns: list[float]) -> list[Trajectory]:
+    """One to three turns in one sequence each, paid at the end."""
+    turns = [1 + i % 3 for i in range(len(returns))]
+    return [
+        episode(random_calls(i, turns=n), [0.0] * (n - 1) + [r], rollout=i % GENERATIONS)
+        for i, (n, r) in enumerate(zip(turns, returns, strict=True))
+    ]
 
-    tokenizer = tiny_tokenizer()
-    stock = GRPOTrainer(
-        tiny_model(tokenizer),
-        reward_funcs=lambda value, **_: value,
-        args=GRPOConfig(**settings(tmp_path / "stock", loss_type=loss_type, **one)),
-        train_dataset=Dataset.from_list([{"prompt": str(i)} for i in range(GROUPS)]),
-        processing_class=tokenizer,
-        rollout_func=rollout_func,
-    )
-    assert relative_difference(spy.gradients, spied(stock).gradients) < 1e-5
+
+@pytest.mark.parametrize("returns", [RETURNS, ZERO_ADVANTAGES], ids=["spread", "zero_advantages"])
+@pytest.mark.parametrize("changes", CASES, ids=lambda c: "-".join(map(str, c.values())))
+def test_single_sequence_work_equals_stock_trl(
+    tmp_path: Any, monkeypatch: Any, changes: dict[str, Any], returns: list[float]
+) -> None:
+    episodes = conversations(returns)
+    spy = ours(tmp_path / "ours", episodes, monkeypatch, **changes)
+    other = spied(stock_trainer(tmp_path / "stock", episodes, **changes))
+    assert relative_difference(spy.gradients, other.gradients) < 1e-5
+
+
+def with_lora(seed: int = 0) -> Any:
+    torch.manual_seed(seed)
+    lora = LoraConfig(r=2, lora_alpha=4, target_modules=["q_proj", "v_proj"])
+    return get_peft_model(tiny_model(tiny_tokenizer()), lora)
+
+
+def moved_from_its_start(trainer: GRPOTrainer) -> GRPOTrainer:
+    """The policy a little away from what its reference is."""
+    g = torch.Generator().manual_seed(3)
+    for name, parameter in trainer.model.named_parameters():
+        if ".default." in name:
+            parameter.data += 0.05 * torch.randn(parameter.shape, generator=g)
+    return trainer
+
+
+def answers(returns: list[float]) -> list[Trajectory]:
+    """One call each; half of the answers end with the end-of-sequence token, the others were cut off."""
+    end = tiny_tokenizer().eos_token_id
+    episodes = []
+    for i, value in enumerate(returns):
+        (c,) = random_calls(i, 1)
+        ids = [*c.completions[0].token_ids, *([end] if i % 2 else [])]
+        logprobs = tuple([-1.0] * len(ids))
+        done = replace(
+            c.completions[0], token_ids=tuple(ids), logprobs=logprobs, finish_reason="stop" if i % 2 else "length"
+        )
+        episodes.append(episode([replace(c, completions=(done,))], [value], rollout=i % GENERATIONS))
+    return episodes
+
+
+@pytest.mark.parametrize("changes", [{}, {"loss_type": "cispo"}, {"beta": 0.1}], ids=["dapo", "cispo", "kl"])
+def test_metrics_are_those_of_stock_trl(tmp_path: Any, monkeypatch: Any, changes: dict[str, Any]) -> None:
+    episodes = answers(ZERO_ADVANTAGES)
+    build = {
+        "ours": partial(our_trainer, episodes=episodes, monkeypatch=monkeypatch),
+        "stock": partial(stock_trainer, episodes=episodes),
+    }
+    logged: dict[str, dict[str, float]] = {}
+    for name, make in build.items():
+        trainer = make(
+            tmp_path / name, model=with_lora() if changes.get("beta") else None, **ONE_MICRO_BATCH, **changes
+        )
+        (moved_from_its_start(trainer) if changes.get("beta") else trainer).train()
+        logged[name] = {k: v for k, v in trainer.state.log_history[0].items() if k != "step_time"}
+    mine, theirs = logged["ours"], logged["stock"]
+    assert set(theirs) <= set(mine)  # every name that TRL logs
+    assert {"reward", "frac_reward_zero_std", "completions/clipped_ratio", "num_tokens", "entropy"} <= set(theirs)
+    assert {"kl"} <= set(theirs) or "beta" not in changes
+    for name, value in theirs.items():
+        assert mine[name] == pytest.approx(value, rel=1e-4, abs=1e-5), name
+
+
+@pytest.mark.parametrize("loss_type", ["dr_grpo", "dppo"])
+def test_losses_of_ours_do_not_depend_on_rows(tmp_path: Any, monkeypatch: Any, loss_type: str) -> None:
+    """13 rows of 8 episodes: the sum over trained tokens over one number, by hand."""
+    episodes = uneven_episodes()
+    spy = ours(tmp_path, episodes, monkeypatch, loss_type=loss_type)
+    returns = torch.tensor(RETURNS).view(GROUPS, GENERATIONS)
+    advantages = ((returns - returns.mean(1, keepdim=True)) / (returns.std(1, keepdim=True) + 1e-4)).flatten()
+    rows = [(s, advantages[i].item()) for i, e in enumerate(episodes) for s in build_sequences(e)]
+    # On policy both are the plain policy gradient; dr_grpo divides by 8 rollouts x 40 tokens, dppo by the tokens.
+    trained = sum(s.trained for s, _ in rows)
+    factor = trained / (8 * 40) if loss_type == "dr_grpo" else 1.0
+    expected = manual_gradient(rows, tiny_model(tiny_tokenizer()))
+    assert relative_difference(spy.gradients, {n: g * factor for n, g in expected.items()}) < 1e-5
 
 
 def manual_gradient(rows: list[tuple[Any, float]], model: Any) -> dict[str, torch.Tensor]:

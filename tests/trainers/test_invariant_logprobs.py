@@ -17,8 +17,9 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.models import ModelNotFoundError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
-from trainers.batches import collate, rows_logprobs
 from trainers.config import ScaffoldConfig
+from trainers.forward import rows_logprobs
+from trainers.micro_batches import collate
 from trainers.policy import load_policy
 from trainers.sequences import Row, build_sequences
 from trainers.tree import enable_tree

@@ -23,15 +23,16 @@ from rewards import RewardSet
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
 from tests.trainers.test_supo import configured, credited, played
-from trainers.batches import blank_row, collate, deal
-from trainers.config import EXACT_LOSSES, ROW_LOSSES
+from trainers.checks import notes
+from trainers.losses import LOSSES
+from trainers.micro_batches import collate, padding_row, partition
 from trainers.runlog import RunLog
 from trainers.sequences import Row, TokenSequence
 
 COVERED = {
     "1 normalising over rows": ["test_credit.py::test_rows_per_episode_do_not_move_the_baseline"],
     "2 the last row as representative": ["test_pitfalls.py::test_an_untrained_last_segment_silences_nothing"],
-    "3 broadcast by position": ["test_pitfalls.py::test_every_row_keeps_its_own_advantage_however_it_is_dealt"],
+    "3 broadcast by position": ["test_pitfalls.py::test_every_row_keeps_its_own_advantage_in_any_partition"],
     "4 wrong group key": ["test_pitfalls.py::test_a_group_is_one_task_played_by_all_its_rollouts"],
     "5 mean over an empty mask": [
         "test_pitfalls.py::test_nothing_to_learn_is_no_nan",
@@ -41,7 +42,7 @@ COVERED = {
         "test_pitfalls.py::test_losses_that_weigh_rows_are_named_or_refused",
         "test_grpo.py::test_uneven_rows_give_the_full_batch_gradient_in_one_step",
     ],
-    "7 remainder rows dropped": ["test_pitfalls.py::test_every_row_keeps_its_own_advantage_however_it_is_dealt"],
+    "7 remainder rows dropped": ["test_pitfalls.py::test_every_row_keeps_its_own_advantage_in_any_partition"],
     "8 dummy rows in the denominator": ["test_pitfalls.py::test_the_denominator_counts_what_is_trained"],
     "9 acted, but the result is never seen": ["test_summary.py::test_every_eight_actions_a_summary_replaces"],
     "10 context not really switched": ["test_summary.py::test_every_eight_actions_a_summary_replaces"],
@@ -86,18 +87,22 @@ def _row(number: int, length: int) -> Row:
 
 
 @given(st.lists(st.integers(1, 6), max_size=20), st.integers(1, 5), st.integers(0, 3), st.booleans())
-def test_every_row_keeps_its_own_advantage_however_it_is_dealt(
-    lengths: list[int], hands: int, room: int, together: bool
+def test_every_row_keeps_its_own_advantage_in_any_partition(
+    lengths: list[int], count: int, room: int, by_prefix: bool
 ) -> None:
     rows = [_row(i, n) for i, n in enumerate(lengths)]
-    wanted = -(-max(1, len(rows)) // hands) + room
-    dealt = deal(rows, hands, blank=blank_row(0), rows_per_hand=wanted, together=together)
+    size = -(-max(1, len(rows)) // count) + room
+    parts = partition(rows, count, padding=padding_row(0), size=size, by_prefix=by_prefix)
     # The number of micro-batches is fixed, all are of one size, and no row is lost or doubled.
-    assert [len(hand) for hand in dealt] == [wanted] * hands
-    assert sorted(r.episode for hand in dealt for r in hand if r.episode >= 0) == list(range(len(rows)))
-    for hand in dealt:
-        batch = collate(hand, 0)
-        for i, row in enumerate(hand):
+    assert [len(part) for part in parts] == [size] * count
+    assert sorted(r.episode for part in parts for r in part if r.episode >= 0) == list(range(len(rows)))
+    # As many rows in each, short of one: none is empty while there are rows enough.
+    filled = [sum(r.episode >= 0 for r in part) for part in parts]
+    assert max(filled) - min(filled) <= 1 or not by_prefix
+    assert min(filled) >= min(1, len(rows) // count)
+    for part in parts:
+        batch = collate(part, 0)
+        for i, row in enumerate(part):
             number = row.episode
             assert batch["advantages"][i] == (number + 1 if number >= 0 else 0)
             if number >= 0:
@@ -127,18 +132,18 @@ def test_nothing_to_learn_is_no_nan(tmp_path: Path) -> None:
 
 
 def test_losses_that_weigh_rows_are_named_or_refused(tmp_path: Path) -> None:
-    for loss_type in EXACT_LOSSES:
-        assert configured(tmp_path, loss_type=loss_type).warnings() == []
-    for loss_type in ROW_LOSSES:
-        (note,) = configured(tmp_path, loss_type=loss_type).warnings()
-        assert loss_type in note and "'dapo' does not depend on rows" in note
+    for loss_type, spec in LOSSES.items():
+        told = notes(configured(tmp_path, loss_type=loss_type))
+        assert [loss_type in note and "'dapo' does not depend on rows" in note for note in told] == (
+            [True] if spec.depends_on_rows else []
+        )
     # GSPO's ratio is of a row, not of a rollout.
     with pytest.raises(SpecError, match="speaks of rows"):
         configured(tmp_path, importance_sampling_level="sequence").check()
 
 
 def test_the_denominator_counts_what_is_trained(tmp_path: Path) -> None:
-    """Blank rows have no trained token; rows without gradient count unless their groups are skipped by choice."""
+    """Rows of padding have no trained token; rows without gradient count unless their groups are skipped by choice."""
     values = [1.0, 1.0, 0.0, 1.0]  # the first group has no variance
     episodes = [episode([call(0, [1, i], [2] * (i + 1))], [v], rollout=i % 2) for i, v in enumerate(values)]
     kept = credited(episodes, configured(tmp_path, num_generations=2))
@@ -146,7 +151,7 @@ def test_the_denominator_counts_what_is_trained(tmp_path: Path) -> None:
     assert kept.metrics["rollouts/trained_tokens"] == 1 + 2 + 3 + 4
     assert skipped.metrics["rollouts/trained_tokens"] == 3 + 4
     assert kept.metrics["groups/zero_variance"] == skipped.metrics["groups/zero_variance"] == 0.5
-    assert blank_row(0).sequence.trained == 0 and blank_row(0).zero_gradient
+    assert padding_row(0).sequence.trained == 0 and padding_row(0).zero_gradient
 
 
 def test_the_logged_denominator_is_that_of_the_loss(tmp_path: Path) -> None:

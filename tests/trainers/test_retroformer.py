@@ -27,9 +27,9 @@ from tests.trainers.builders import CPU_RUN, call, episode
 from tests.trainers.played import toy_tasks
 from tests.trainers.test_resume import _stop_after
 from trainers.audit import audit
-from trainers.batches import rows_logprobs
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
+from trainers.forward import rows_logprobs
 from trainers.policy import ACTOR, TRAINED, load_actor_and_reflector, load_policy
 from trainers.retroformer import RetroformerTrainer, as_retroformer, play_trials
 from trainers.rollouts import task_rows

@@ -18,10 +18,11 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
-from recipes.common import CONFIGS, parse_config
+from recipes.common import CONFIGS
 from tests.toy_env import TOY
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_trainer
+from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
@@ -78,7 +79,7 @@ def test_what_is_not_supo_is_refused(tmp_path: Path, agent: dict[str, Any], mess
 
 
 def test_the_recipe_s_configuration_is_supo() -> None:
-    config = parse_config(["--config", str(CONFIGS / "supo_cpu.yaml")])
+    config = parse_config([], default=CONFIGS / "supo_cpu.yaml")
     config.check()
     before = (config.spec.to_data(), list(config.train_calls), list(config.mask_truncated))
     as_supo(config)

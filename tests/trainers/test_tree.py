@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 pytest.importorskip("trl")
 
 from tests.tiny import tiny_model, tiny_tokenizer
-from trainers.batches import rows_logprobs
+from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence
 from trainers.tree import build_tree, enable_tree
 

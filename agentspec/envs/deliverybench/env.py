@@ -84,11 +84,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         "render_modes": ["rgb_array"],
         "render_fps": 4,
         "metrics": (
-            Metric(
-                "hourly_profit",
-                "$/h",
-                summary="growth of the balance per hour of the shift (of the time played if cut)",
-            ),
+            Metric("hourly_profit", "$/h", summary="growth of the balance per hour of the shift, or played if cut"),
             Metric("net_earnings", "$", summary="growth of the balance"),
             Metric("deliveries", summary="orders delivered"),
         ),

@@ -236,7 +236,9 @@ def _files(path: Path) -> list[Path]:
 
 def main(argv: list[str] | None = None, show: Callable[[str], None] = print) -> int:
     """The command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="agentspec.envs.deliverybench.replay", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, prog="agentspec.envs.deliverybench.replay", description=__doc__.split("\n")[0]
+    )
     parser.add_argument("--maps", type=Path, required=True, help="folder that holds one folder per city")
     parser.add_argument("--traces", type=Path, required=True, help="a reference episode, or a folder of them")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")

@@ -18,7 +18,9 @@ from agentspec.envs.deliverybench.city.generate import PLANS, SPLITS, split_of, 
 def main(argv: Sequence[str] | None = None) -> int:
     """Write cities and print one line each: the folder and the split of its seed."""
     ranges = ", ".join(f"{name} {seeds.start}-{seeds.stop - 1}" for name, seeds in SPLITS.items())
-    parser = argparse.ArgumentParser(description="Write generated cities in the benchmark's map format.")
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description="Write generated cities in the benchmark's map format."
+    )
     parser.add_argument("folder", help="where each city gets a folder SIZE-SEED")
     parser.add_argument("--size", choices=list(PLANS), default="small")
     parser.add_argument("--seed", type=int, default=0, help=f"first city seed ({ranges})")

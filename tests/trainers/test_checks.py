@@ -1,0 +1,138 @@
+"""Every inherited field is read, fixed or refused; what is refused names where it is set instead."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("trl")
+
+import accelerate
+import transformers
+import trl
+from trl import GRPOConfig
+
+from agentspec.registry import SpecError
+from trainers.arguments import parse_config
+from trainers.checks import check_given, check_reporters
+from trainers.config import ScaffoldConfig
+from trainers.fields import FIXED, REFUSED, USED, field_rules
+
+ROOT = Path(__file__).resolve().parents[2]
+INHERITED = [f.name for f in fields(GRPOConfig)]
+RULES = field_rules(GRPOConfig)
+
+
+def config(tmp_path: Path, **changes: Any) -> ScaffoldConfig:
+    return ScaffoldConfig(output_dir=str(tmp_path), use_cpu=True, bf16=False, report_to=[], **changes)
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+def test_every_field_of_the_installed_trl_has_one_row() -> None:
+    assert set(INHERITED) <= set(RULES), f"new in TRL {trl.__version__}: give them a row in trainers/fields.py"
+    rows = [n for names in (*USED.values(), *REFUSED.values()) for n in names.split()] + list(FIXED)
+    assert len(rows) == len(set(rows))
+    # None of our own fields hides one of TRL's that is refused.
+    redeclared = set(ScaffoldConfig.__annotations__) & set(INHERITED)
+    assert {n: RULES[n].status for n in redeclared} == {"vllm_importance_sampling_mode": "used"}
+
+
+def test_the_page_is_current() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "update_training_fields.py"))
+    text = script["PAGE"].read_text(encoding="utf-8")
+    assert text == script["page"](GRPOConfig), "run `python docs/update_training_fields.py`"
+
+
+def test_fields_that_are_called_used_are_named_by_who_uses_them() -> None:
+    """Outside the dataclasses that declare them: `max_steps` must occur in a trainer, say."""
+    declare = {"training_args.py", "grpo_config.py", "fields.py"}
+    folders = [Path(m.__file__ or "").parent for m in (transformers, trl, accelerate)]
+    files = [*folders[0].glob("trainer*.py"), *folders[0].glob("integrations/*.py"), *folders[1].rglob("*.py")]
+    files += [*folders[2].rglob("*.py"), *(ROOT / "trainers").glob("*.py"), folders[0] / "modeling_utils.py"]
+    text = "\n".join(p.read_text(encoding="utf-8") for p in files if p.name not in declare)
+    # What TrainingArguments itself turns into settings of torch, of the logger or of accelerate.
+    at_once = {"tf32", "log_level", "log_level_replica", "log_on_each_node", "ddp_backend", "ddp_timeout", "local_rank"}
+    missing = [n for names in USED.values() for n in names.split() if f".{n}" not in text and n not in at_once]
+    assert missing == []
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+def test_the_defaults_are_not_refused(tmp_path: Path) -> None:
+    config(tmp_path).check()
+    config(tmp_path, eval_strategy="steps", eval_steps=2, save_steps=2).check()
+
+
+@pytest.mark.parametrize("name", [n for n, rule in RULES.items() if rule.status != "used" and n in INHERITED])
+def test_a_field_that_nobody_reads_is_refused(tmp_path: Path, name: str) -> None:
+    given = config(tmp_path)
+    setattr(given, name, "something else")
+    with pytest.raises(SpecError) as caught:
+        given.check()
+    assert name in str(caught.value) and RULES[name].why in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "remedy"),
+    [
+        ({"temperature": 0.7}, "agent: {sampling: {...}}"),
+        ({"top_p": 0.9}, "agent: {sampling: {...}}"),
+        ({"generation_kwargs": {"top_k": 3}}, "agent: {sampling: {...}}"),
+        ({"reward_weights": [1.0]}, "set `rewards: {name: weight}`"),
+        ({"model_init_kwargs": {"dtype": "float16"}}, "`model`, `adapter` and `bf16`"),
+        ({"label_smoothing_factor": 0.1}, "no labels"),
+        ({"use_transformers_paged": True}, "`batching`"),
+        ({"max_completion_length": 64}, "agent: {sampling: {max_tokens: ...}}"),
+        ({"off_policy_mask_threshold": 0.5}, "per row"),
+        ({"entropy_coef": 0.01}, "no gradient"),
+        ({"use_adaptive_entropy": True}, "no gradient"),
+        ({"adapter": "smollm2-135m-courier", "lora_r": 64}, "lora_r is 64 beside adapter"),
+        ({"adapter": "smollm2-135m-courier", "lora_layers": 2}, "lora_layers is 2 beside adapter"),
+        ({"adapter": "smollm2-135m-courier", "lora_targets": ["q_proj"]}, "lora_targets is ['q_proj'] beside adapter"),
+        ({"agent": {"reasoning": {"name": "tot", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
+        ({"agent": {"reasoning": {"name": "rap", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
+    ],
+)
+def test_a_setting_without_effect_says_where_it_is_set(tmp_path: Path, changes: dict[str, Any], remedy: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        config(tmp_path, **changes).check()
+    assert remedy in str(caught.value)
+
+
+def test_what_is_set_with_effect_is_accepted(tmp_path: Path) -> None:
+    config(tmp_path, loss_type="dr_grpo", max_completion_length=64).check()  # its constant length
+    config(tmp_path, lora_r=64).check()
+    # Greedy calls that are not trained: lessons, while actions are.
+    reflection = {"name": "retroformer", "temperature": 0.0}
+    config(tmp_path, agent={"reasoning": "direct", "reflection": reflection, "scope": "run"}).check()
+
+
+def test_naming_an_unread_field_is_refused_even_at_its_default(tmp_path: Path) -> None:
+    """`temperature: 1.0` beside an agent at 0.7 would mislead; the default of a fixed field is harmless."""
+    with pytest.raises(SpecError, match=r"c\.yaml: `temperature` is not read"):
+        check_given(["learning_rate", "temperature"], "c.yaml")
+    check_given(["scale_rewards", "learning_rate", "model"], "c.yaml")
+    path = tmp_path / "c.yaml"
+    path.write_text("use_cpu: true\nbf16: false\n")
+    with pytest.raises(SpecError, match="command line: `max_tool_calling_iterations` is not read"):
+        parse_config(["--config", str(path), "--max-tool-calling-iterations", "3"], default="")
+
+
+def test_where_logs_go_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: dict[str, Any] = {"tensorboard": None, "wandb": object()}
+    monkeypatch.setattr("trainers.checks.importlib.util.find_spec", lambda name: found[name])
+
+    class Reporting:
+        report_to = ["wandb", "tensorboard"]  # noqa: RUF012
+
+    with pytest.raises(SpecError, match=r"report_to names tensorboard.*pip install 'agentspec-rl\[tensorboard\]'"):
+        check_reporters(Reporting())
+    Reporting.report_to = ["wandb"]
+    check_reporters(Reporting())

@@ -1,0 +1,72 @@
+"""A run ends at the first number that is none, before anything of it is saved.
+
+transformers logs a loss of NaN as 0.0 and goes on, and the weights are NaN from there: nothing in the logs says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import nn
+from transformers import TrainerCallback
+
+
+class NonFiniteError(ValueError):
+    """A loss, a gradient or a weight is NaN or infinite."""
+
+
+class FiniteGuard(TrainerCallback):
+    """Looks at gradients before, and at trained weights after every optimiser step."""
+
+    def on_pre_optimizer_step(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        if not args.fp16:  # there the gradient scaler expects infinities, and skips the step
+            named = ((n, p.grad) for n, p in kwargs["model"].named_parameters() if p.grad is not None)
+            require_finite("gradient", named, state.global_step)
+
+    def on_optimizer_step(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        require_finite("weight", trained(kwargs["model"]), state.global_step)
+
+
+def trained(model: nn.Module) -> Iterable[tuple[str, torch.Tensor]]:
+    """Name and value of the parameters under training."""
+    return ((n, p.detach()) for n, p in model.named_parameters() if p.requires_grad)
+
+
+def require_finite(what: str, named: Iterable[tuple[str, torch.Tensor]], step: int) -> None:
+    """Refuse a tensor that is not finite.
+
+    Args:
+        what: what the tensors are.
+        named: their names, and of sharded ones this process's part.
+        step: number of updates made before.
+
+    Raises:
+        NonFiniteError: which tensor, in which update, and what to look at.
+    """
+    tensors = [(n, t.to_local() if hasattr(t, "to_local") else t) for n, t in named]
+    tensors = [(n, t) for n, t in tensors if t.numel()]
+    if not tensors:
+        return
+    finite = torch.stack([t.abs().max().isfinite() for _, t in tensors]).tolist()
+    bad = [n for (n, _), ok in zip(tensors, finite, strict=True) if not ok]
+    if bad:
+        raise NonFiniteError(
+            f"{what} of update {step} is not finite ({len(bad)} of {len(tensors)}, the first: {bad[0]}); nothing of it "
+            "was saved. Lower learning_rate or set max_grad_norm; a reference (beta) or a temperature that makes "
+            "log-probabilities infinite shows here too"
+        )
+
+
+def without_dropout(model: nn.Module) -> None:
+    """Turn dropout off for good: an update must see the probabilities that were sampled from.
+
+    A warm-start adapter may bring `lora_dropout`, a base model `attention_dropout`; their configurations stay.
+    """
+    for module in model.modules():
+        if isinstance(module, nn.modules.dropout._DropoutNd):
+            module.p = 0.0
+        for name, value in list(vars(module).items()):
+            if name.endswith("dropout") and isinstance(value, float):
+                setattr(module, name, 0.0)

@@ -1,0 +1,106 @@
+"""What is logged of a generation round, under TRL's names where TRL has one.
+
+A *completion*, where TRL speaks of one, is everything that the policy chose in an episode: the trained tokens of all
+its calls. Figures are over the episodes of all ranks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from trl.trainer.utils import nanstd
+
+from agentspec.trajectory import Trajectory
+from trainers.credit import ScoredEpisode
+from trainers.sequences import TrainFilter, trained_completions
+
+EPISODE = ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries")
+"""Figures of an episode that are logged as `episode/NAME` where it has them."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """Of one episode: its reward terms, unweighted (`None` if it failed), and its completion."""
+
+    terms: Mapping[str, float] | None
+    length: int
+    clipped: bool
+
+
+def played(episode: ScoredEpisode, train: TrainFilter) -> Played:
+    """What the logs need of an episode."""
+    completions = trained_completions(episode.trajectory, train)
+    free = [a is None or len(a) > 1 for _, c in completions for a in c.allowed or (None,) * len(c.token_ids)]
+    clipped = bool(completions) and completions[-1][1].finish_reason == "length"
+    return Played(None if episode.score is None else episode.score.sums, sum(free), clipped)
+
+
+def round_metrics(
+    episodes: Sequence[ScoredEpisode],
+    train: TrainFilter,
+    weights: Mapping[str, float],
+    *,
+    group: int,
+    gather: Callable[[list[Any]], list[Any]] = list,
+) -> dict[str, float]:
+    """Reward and completion figures of a round.
+
+    Args:
+        episodes: this rank's.
+        weights: by reward.
+        group: rollouts per task.
+    """
+    everyone: list[Played] = gather([played(e, train) for e in episodes])
+    return reward_metrics([p.terms for p in everyone], weights, group) | completion_metrics(everyone)
+
+
+def reward_metrics(
+    terms: Sequence[Mapping[str, float] | None], weights: Mapping[str, float], group: int
+) -> dict[str, float]:
+    """`rewards/NAME/mean` and `/std`, `reward`, `reward_std` and `frac_reward_zero_std`, as TRL computes them."""
+    values = torch.tensor([[math.nan if t is None else t[name] for name in weights] for t in terms])
+    metrics: dict[str, float] = {}
+    for i, name in enumerate(weights):
+        metrics[f"rewards/{name}/mean"] = values[:, i].nanmean().item()
+        metrics[f"rewards/{name}/std"] = nanstd(values[:, i]).item()
+    totals = (values * torch.tensor(list(weights.values()))).sum(dim=1)
+    deviations = nanstd(totals.view(-1, group), dim=1)
+    metrics["reward"] = totals.nanmean().item()
+    metrics["reward_std"] = nanstd(totals).item()
+    metrics["frac_reward_zero_std"] = deviations.isclose(torch.zeros_like(deviations)).float().mean().item()
+    return metrics
+
+
+def completion_metrics(everyone: Sequence[Played]) -> dict[str, float]:
+    """`completions/...`: lengths in trained tokens per episode, and of those whose last answer was not cut off."""
+    ended = [p.length for p in everyone if not p.clipped] or [0]
+    metrics = {"completions/clipped_ratio": sum(p.clipped for p in everyone) / len(everyone)}
+    for kind, lengths in (("length", [p.length for p in everyone]), ("terminated_length", ended)):
+        metrics[f"completions/mean_{kind}"] = sum(lengths) / len(lengths)
+        metrics[f"completions/min_{kind}"] = float(min(lengths))
+        metrics[f"completions/max_{kind}"] = float(max(lengths))
+    return metrics
+
+
+def episode_metrics(trajectories: Sequence[Trajectory]) -> dict[str, float]:
+    """`episode/NAME`: mean figures of the episodes that did not fail."""
+    metrics = {}
+    for name in EPISODE:
+        values = [float(t.metrics[name]) for t in trajectories if t.scorable and name in t.metrics]
+        if values:
+            metrics[f"episode/{name}"] = sum(values) / len(values)
+    return metrics
+
+
+def named(reward: str) -> Callable[..., Any]:
+    """A reward function as TRL wants one, by name only: episodes are scored before credit, not by TRL."""
+
+    def score(**_: Any) -> Any:
+        raise NotImplementedError("episodes are scored once, as they are played")
+
+    score.__name__ = reward
+    return score
