@@ -21,5 +21,5 @@ def test_thinking_can_be_switched_off_in_training(tmp_path: Path) -> None:
         model, loaded = load_policy(ScaffoldConfig(**given, chat_template_kwargs=variables))
         written = loaded.decode(render([user("hi")], loaded))
         assert ("</think>" in written) == silent
-        sampled_with = LocalLLM(model, loaded).chat.render([user("hi")])
+        sampled_with = LocalLLM(model, loaded, name="policy").chat.render([user("hi")])
         assert loaded.decode(sampled_with) == written
