@@ -92,12 +92,16 @@ def _load_base(config: ScaffoldConfig) -> tuple[nn.Module, Any, str]:
     """Model, tokenizer and where they came from."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
+    from agentspec.llm.chat import set_template_kwargs
     from agentspec.llm.models import quiet, resolve
 
     path = resolve(config.model).path
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
     with quiet():
-        return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
+        model, tokenizer = AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path)
+    # Every prompt of the run is rendered with this tokenizer: rollouts on all backends, demonstrations, validation.
+    set_template_kwargs(tokenizer, config.chat_template_kwargs or {})
+    return model, tokenizer, path
 
 
 @contextmanager
