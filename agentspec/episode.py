@@ -13,7 +13,7 @@ import math
 import queue
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +21,8 @@ from typing import Any, TypeVar
 from agentspec.agent import Agent
 from agentspec.envs import environment_id, make_env
 from agentspec.llm.base import LLM, ContextOverflowError, LLMError
+from agentspec.llm.helpers import helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
@@ -120,6 +122,9 @@ class Runner:
         timeout_s: limit of every environment call, in seconds (``None``: none).
         max_steps: most steps of an episode, on top of the environment's own limit.
         policy: label of the policy, for tables.
+        on_done: called with each episode when it has ended.
+        on_step: called with the task and each step of its episode when it was taken.
+        progress: number of jobs -> what to call after each (`agentspec.progress.episode_progress`).
     """
 
     spec: AgentSpec
@@ -132,6 +137,8 @@ class Runner:
     embedder: Embedder | None = None
     policy: str = ""
     on_done: Callable[[Trajectory], None] | None = None
+    on_step: Callable[[Task, Transition], None] | None = None
+    progress: Callable[[int], Callable[[Trajectory], None]] | None = None
 
     def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """Run all jobs; trajectories come back in the order of the jobs."""
@@ -140,19 +147,25 @@ class Runner:
     async def run_async(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
-        self.spec.check(frozenset(llm.capabilities) | {"snapshots"}, f"backend {llm.name!r}")
+        self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
+        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items() if self.spec.helped(pattern)}
+        progress = self.progress(len(jobs)) if self.progress else None
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
         async def guarded(job: Job) -> Trajectory:
             async with gate:
-                trajectory = await self._episode(job, llm)
-            if self.on_done:
-                self.on_done(trajectory)
+                trajectory = await self._episode(job, llm, helpers)
+            for tell in filter(None, (self.on_done, progress)):
+                tell(trajectory)
             return trajectory
 
         return list(await asyncio.gather(*(guarded(job) for job in jobs)))
 
-    async def _episode(self, job: Job, llm: LLM) -> Trajectory:
+    def _offered(self, llm: LLM) -> frozenset[str]:
+        """What modules may need and get: of the backend, and of the caller."""
+        return frozenset(llm.capabilities) | ({"embedder"} if self.embedder else frozenset())
+
+    async def _episode(self, job: Job, llm: LLM, helpers: Mapping[str, LLM]) -> Trajectory:
         name = f"{job.task.key}-{job.rollout}-{job.seed:x}"
         recorder = Recorder(
             llm,
@@ -161,6 +174,7 @@ class Runner:
             sampling=self.spec.sampling,
             budget=self.spec.budget,
             prices=self.prices,
+            helpers=helpers,
         )
         agent = self.spec.build(recorder, embedder=self.embedder)
         worker = EnvWorker(self.timeout_s)
@@ -168,7 +182,9 @@ class Runner:
         try:
             return await self._play(job, agent, worker)
         finally:
-            llm.leave(name)
+            # Episodes never enter at a helper: it waits for nobody, and nobody waits for it.
+            for backend in (llm, *helpers.values()):
+                backend.leave(name)
             worker.close()
 
     async def _play(self, job: Job, agent: Agent, worker: EnvWorker) -> Trajectory:
@@ -183,7 +199,7 @@ class Runner:
             simulator = simulator_of(env, worker, job.task, agent.perception)
             if simulator is None:
                 who = f"environment {job.task.env!r} without snapshot() and restore()"
-                self.spec.check(frozenset(agent.recorder.llm.capabilities), who)
+                self.spec.check(self._offered(agent.recorder.llm), who)
             agent.attach_simulator(simulator)
             observation, info = await worker.call("reset", lambda: env.reset(seed=job.task.seed))
             agent.begin_episode(job.task)
@@ -196,6 +212,8 @@ class Runner:
                     ended = "budget"
                     break
                 transitions.append(transition)
+                if self.on_step:
+                    self.on_step(job.task, transition)
                 await agent.learn(transition)
         except ContextOverflowError as caught:
             ended, error = "context", str(caught)
@@ -305,29 +323,6 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "problems": sum(recorder.problems.values()),
         "ended": ended,
     }
-
-
-class NoLLM:
-    """The backend of agents without a model: any call is an error that says so."""
-
-    name = "none"
-    capabilities: frozenset[str] = frozenset()
-    max_context = 0
-
-    async def generate(self, request: Any) -> Any:
-        raise LLMError(f"{request.tag.path} asked for a model, but none was configured; name one with `--model`")
-
-    async def score(self, messages: Any, continuations: Any, *, episode: str = "") -> Any:
-        raise LLMError("a module asked for scores, but no model was configured; name one with `--model`")
-
-    def count_tokens(self, text: str) -> int:
-        return len(text) // 4 + 1
-
-    def enter(self, episode: str) -> None:
-        return None
-
-    def leave(self, episode: str) -> None:
-        return None
 
 
 __all__ = ["EnvWorker", "EnvironmentFailedError", "Job", "NoLLM", "Runner", "environment_id", "make_env"]

@@ -1,77 +1,96 @@
-"""How a name in a spec finds a class, and what that class costs and needs.
+"""How a name in a spec finds a class.
 
-One plain dict per kind. A target is ``"module:Class"`` and is imported only when it is built. Every entry declares its
-call profile (model calls per retrieve, store, step and episode) and what it needs of the backend, so that cost and
-capability are known before a run. ``register`` adds methods of your own.
+A name is one of:
 
-A method whose paper's settings are too dear for reinforcement learning has two cost presets, chosen by its parameter
-``preset``: ``paper`` (the default) and ``rl``. Both profiles are declared; the contract tests hold them against what is
-really called.
+- a method of this package: `agentspec/<kind>/<name>.py` holds its class, and the class its declaration (see
+  :mod:`agentspec.declaration`); nothing else is imported to find it;
+- `package.module:Class`, anybody's;
+- a name of a module that was brought in: by `import_modules` (`--import` on the command line, `imports` in a spec or
+  configuration) or by an installed distribution with an entry point in the group `agentspec.modules` (`name =
+  package.module:Class`) or `agentspec.envs` (`name = package.module`, which registers environments when imported).
+
+The registry knows no method by itself. A class becomes a module by its methods (a memory has `retrieve` and `store`, a
+reasoner `decide`) and by `declaration`.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+import inspect
+import pkgutil
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from types import ModuleType
 from typing import Any, Literal
 
 from agentspec.actions import suggest
+from agentspec.declaration import CallProfile, Declaration, Purpose
+from agentspec.importing import SpecError, import_module
+
+__all__ = ["REGISTRY", "CallProfile", "Declaration", "Entry", "Purpose", "Registry", "SpecError", "import_modules"]
 
 Kind = Literal["env", "perception", "memory", "reasoning", "reflection"]
+KINDS: tuple[Kind, ...] = ("env", "perception", "memory", "reasoning", "reflection")
+METHODS: Mapping[Kind, tuple[str, ...]] = {
+    "perception": ("perceive",),
+    "memory": ("retrieve", "store"),
+    "reasoning": ("decide",),
+    "reflection": ("lessons", "revise"),
+}
+"""Which methods make a class a module of a kind."""
 
-
-class SpecError(ValueError):
-    """A spec, name or configuration that cannot work: what was given, what was expected, what to do."""
-
-
-@dataclass(frozen=True)
-class CallProfile:
-    """Model calls as (fewest, most) per occasion under the parameters of a preset.
-
-    A call is one request, whatever the number of samples it asks for. ``step`` is one decision (reasoning) or one
-    revision (reflection); ``episode`` is what happens at an episode's end.
-    """
-
-    retrieve: tuple[int, int] = (0, 0)
-    store: tuple[int, int] = (0, 0)
-    step: tuple[int, int] = (0, 0)
-    episode: tuple[int, int] = (0, 0)
+MODULES_GROUP, ENVS_GROUP = "agentspec.modules", "agentspec.envs"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One registered name.
-
-    Args:
-        target: ``"package.module:Class"`` (for environments: the gymnasium id).
-        calls: the call profile under default parameters (preset ``paper`` where there are presets).
-        purposes: what its calls are for (the part of a call's path after ``/``); ``train`` patterns match these.
-        needs: backend capabilities or ``"snapshots"`` of the environment.
-        summary: one line for ``agentspec list``.
-        rl: the call profile of preset ``rl``; ``None`` for a method without presets.
-        waived: need -> (parameter, value): with that value the method does without the need.
-        envs: registered environments the method is written for; empty: any.
-    """
+    """One registered name: where its class is (for environments: the gymnasium id), and what it declares."""
 
     target: str
-    calls: CallProfile = CallProfile()
-    purposes: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
-    summary: str = ""
-    rl: CallProfile | None = None
-    waived: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
-    envs: tuple[str, ...] = ()
+    declaration: Declaration = Declaration()
+    name: str = ""
+
+    @property
+    def summary(self) -> str:
+        """One line about it."""
+        return self.declaration.summary
+
+    @property
+    def calls(self) -> CallProfile:
+        """The call profile under default parameters."""
+        return self.declaration.calls
+
+    @property
+    def purposes(self) -> Mapping[str, Purpose]:
+        """What its calls are for."""
+        return self.declaration.purposes
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What it needs of the backend, the environment or the spec."""
+        return self.declaration.needs
+
+    @property
+    def waived(self) -> Mapping[str, tuple[str, Any]]:
+        """Needs that a parameter makes superfluous."""
+        return self.declaration.waived
+
+    @property
+    def envs(self) -> tuple[str, ...]:
+        """Environments it is written for; empty: any."""
+        return self.declaration.envs
 
     @property
     def presets(self) -> dict[str, CallProfile]:
         """Call profile by preset; empty for a method without presets."""
-        return {} if self.rl is None else {"paper": self.calls, "rl": self.rl}
+        return self.declaration.presets
 
     def needs_with(self, params: Mapping[str, Any]) -> tuple[str, ...]:
-        """What the method needs when it is built with ``params``."""
-        waived = {need for need, (name, value) in self.waived.items() if params.get(name) == value}
-        return tuple(need for need in self.needs if need not in waived)
+        """What the method needs when it is built with `params`."""
+        return self.declaration.needs_with(params)
 
     def load(self) -> Any:
         """Import the target."""
@@ -79,21 +98,63 @@ class Entry:
         return getattr(importlib.import_module(module), name)
 
     def describe(self) -> dict[str, Any]:
-        """JSON of the entry, as ``agentspec list --json`` prints it."""
+        """JSON of the entry, as `agentspec list --json` prints it."""
         return {
             "summary": self.summary,
             "calls": asdict(self.calls),
             "purposes": list(self.purposes),
             "needs": list(self.needs),
             "presets": {name: asdict(profile) for name, profile in self.presets.items()},
+            "aliases": list(self.declaration.aliases),
+            "target": self.target,
         }
 
 
-@dataclass
 class Registry:
     """All names, by kind."""
 
-    entries: dict[str, dict[str, Entry]] = field(default_factory=dict)
+    def __init__(self, package: str = "agentspec") -> None:
+        self._package = package
+        self._known: dict[str, dict[str, Entry]] = {kind: {} for kind in KINDS}
+        self._complete: set[str] = set()
+
+    @property
+    def entries(self) -> Mapping[str, Mapping[str, Entry]]:
+        """Kind -> name -> entry. Imports every module there is."""
+        return {kind: self.all(kind) for kind in KINDS}
+
+    def all(self, kind: str) -> dict[str, Entry]:
+        """Every name of a kind, sorted. Imports all modules of the kind.
+
+        Raises:
+            SpecError: no such kind.
+        """
+        self._require_kind(kind)
+        if kind not in self._complete:
+            for name in self._files(kind):
+                self._from_file(kind, name)
+            for point in _entry_points(kind):
+                self._from_entry_point(point)
+            self._complete.add(kind)
+        return dict(sorted(self._known[kind].items()))
+
+    def get(self, kind: str, name: str) -> Entry:
+        """The entry of `name` (or of the alias `name`).
+
+        Raises:
+            SpecError: unknown kind or name, with the nearest names.
+        """
+        self._require_kind(kind)
+        if kind != "env" and ":" in name:
+            return _from_path(kind, name)
+        if name not in self._known[kind] and not self._find(kind, name):
+            for entry in self.all(kind).values():
+                if name in entry.declaration.aliases:
+                    return entry
+            if name not in self._known[kind]:
+                aliases = [a for e in self._known[kind].values() for a in e.declaration.aliases]
+                raise SpecError(f"unknown {kind} {name!r}{suggest(name, [*self._known[kind], *aliases])}")
+        return self._known[kind][name]
 
     def register(self, kind: Kind, name: str, entry: Entry) -> None:
         """Add a name.
@@ -101,214 +162,143 @@ class Registry:
         Raises:
             SpecError: the name is taken by another target.
         """
-        known = self.entries.setdefault(kind, {})
+        self._require_kind(kind)
+        known = self._known[kind]
         if name in known and known[name].target != entry.target:
             raise SpecError(f"{kind} {name!r} is already registered as {known[name].target}; choose another name")
-        known[name] = entry
+        known[name] = Entry(entry.target, entry.declaration, name)
 
-    def get(self, kind: str, name: str) -> Entry:
-        """The entry of ``name``.
+    def unregister(self, kind: Kind, name: str) -> None:
+        """Forget a name that was registered."""
+        self._known[kind].pop(name, None)
+
+    def add_module(self, module: ModuleType) -> list[str]:
+        """Register every class of `module` that has a declaration.
+
+        Returns:
+            The names that were added.
+        """
+        added = []
+        for cls in _declared(module):
+            kind = kind_of(cls)
+            name = cls.declaration.name or snake_case(cls.__name__)
+            self.register(kind, name, Entry(f"{module.__name__}:{cls.__name__}", cls.declaration))
+            added.append(name)
+        return added
+
+    def _require_kind(self, kind: str) -> None:
+        if kind not in KINDS:
+            raise SpecError(f"unknown kind of module {kind!r}{suggest(str(kind), KINDS)}")
+
+    def _find(self, kind: str, name: str) -> bool:
+        """Look for `name` where only it need be imported: a file of this package, an entry point."""
+        if kind == "env":
+            self.all(kind)
+        elif name.isidentifier() and name in self._files(kind):
+            self._from_file(kind, name)
+        elif name not in self._known[kind]:
+            for point in _entry_points(kind):
+                if point.name == name:
+                    self._from_entry_point(point)
+        return name in self._known[kind]
+
+    def _files(self, kind: str) -> list[str]:
+        if kind == "env":
+            importlib.import_module(f"{self._package}.envs")  # registers its own when imported
+            return []
+        package = importlib.import_module(f"{self._package}.{kind}")
+        return [m.name for m in pkgutil.iter_modules(package.__path__) if not m.ispkg]
+
+    def _from_file(self, kind: str, name: str) -> None:
+        """Register what `agentspec/<kind>/<name>.py` declares: the class without a name of its own gets the file's."""
+        module = importlib.import_module(f"{self._package}.{kind}.{name}")
+        for cls in _declared(module):
+            called = cls.declaration.name or name
+            self.register(kind_of(cls), called, Entry(f"{module.__name__}:{cls.__name__}", cls.declaration))
+
+    def _from_entry_point(self, point: metadata.EntryPoint) -> None:
+        """Register what an entry point names: a class under the point's name, a module's classes under theirs.
 
         Raises:
-            SpecError: unknown kind or name, with the nearest names.
+            SpecError: it cannot be imported, naming the distribution.
         """
-        known = self.entries.get(kind, {})
-        if name not in known:
-            raise SpecError(f"unknown {kind} {name!r}{suggest(name, known)}")
-        return known[name]
+        try:
+            loaded = point.load()
+        except Exception as error:
+            source = point.dist.name if point.dist else "a distribution"
+            raise SpecError(
+                f"entry point {point.name!r} ({point.value}) of {source} cannot be loaded: {error}; reinstall or "
+                "remove it"
+            ) from error
+        if isinstance(loaded, ModuleType):
+            self.add_module(loaded)
+        elif point.group == MODULES_GROUP and inspect.isclass(loaded):
+            target = f"{loaded.__module__}:{loaded.__qualname__}"
+            declaration = getattr(loaded, "declaration", Declaration())
+            self.register(kind_of(loaded), point.name, Entry(target, declaration))
 
 
 REGISTRY = Registry()
 
 
 def register(kind: Kind, name: str, target: str, summary: str, **declared: Any) -> None:
-    """Register ``name``; ``declared`` are the other fields of :class:`Entry`."""
-    REGISTRY.register(kind, name, Entry(target, summary=summary, **declared))
+    """Register `name` without a class that declares itself; `declared` are the other fields of the declaration."""
+    REGISTRY.register(kind, name, Entry(target, Declaration(summary=summary, **declared)))
 
 
-register(
-    "env",
-    "deliverybench",
-    "agentspec/DeliveryBench-v0",
-    "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
-    needs=(),
-)
+def import_modules(names: Sequence[str]) -> None:
+    """Bring in outside code: every class with a declaration becomes a name; environments register when imported.
 
-register(
-    "perception",
-    "generic",
-    "agentspec.perception.generic:GenericPerception",
-    "image, instruction, state and action schema of any environment that keeps the contract",
-)
-register(
-    "perception",
-    "deliverybench",
-    "agentspec.perception.deliverybench:DeliveryBenchPerception",
-    "the four components of DeliveryBench: image, instruction, state, action schema",
-)
+    Args:
+        names: importable modules (`my_package.memory`), or paths of Python files (`./my_memory.py`). The working
+            directory counts, after everything that is installed.
 
-register("memory", "none", "agentspec.memory.none:NoMemory", "remembers nothing")
-register("memory", "base", "agentspec.memory.base:BaseMemory", "rolling buffer of the most recent steps")
-register(
-    "memory",
-    "summary",
-    "agentspec.memory.summary:SummaryMemory",
-    "SUPO: the policy's own summary replaces the conversation every 8 actions",
-    calls=CallProfile(store=(0, 1)),
-    purposes=("summary",),
-)
-
-register(
-    "reasoning",
-    "direct",
-    "agentspec.reasoning.direct:Direct",
-    "answers with the action only",
-    calls=CallProfile(step=(1, 1)),
-    purposes=("act",),
-)
-register(
-    "reasoning",
-    "cot",
-    "agentspec.reasoning.cot:ChainOfThought",
-    "thinks step by step, then acts; the chain is not carried on",
-    calls=CallProfile(step=(1, 2)),
-    purposes=("think", "act"),
-)
-register(
-    "reasoning",
-    "react",
-    "agentspec.reasoning.react:ReAct",
-    "a growing transcript of thought, action and observation",
-    calls=CallProfile(step=(1, 11)),
-    purposes=("think", "act"),
-)
-register(
-    "reasoning",
-    "rule_based",
-    "agentspec.reasoning.rule_based:RuleBased",
-    "the environment's scripted expert: no model, a baseline and demonstrator",
-    envs=("deliverybench",),
-)
-register(
-    "reasoning",
-    "random",
-    "agentspec.reasoning.rule_based:RandomLegal",
-    "a random sensible action: no model, the floor",
-    envs=("deliverybench",),
-)
-register(
-    "reasoning",
-    "plan_and_solve",
-    "agentspec.reasoning.plan_and_solve:PlanAndSolve",
-    "a plan of sub-goals that persists, then one sub-goal at a time; plans anew when it fails or is done",
-    calls=CallProfile(step=(1, 3)),
-    rl=CallProfile(step=(1, 2)),
-    purposes=("plan", "think", "act"),
-)
-register(
-    "reasoning",
-    "self_consistency",
-    "agentspec.reasoning.self_consistency:SelfConsistency",
-    "independent chains of thought, and a vote over their actions",
-    calls=CallProfile(step=(1, 6)),
-    rl=CallProfile(step=(1, 4)),
-    purposes=("think", "act"),
-    needs=("n",),
-)
-register(
-    "reasoning",
-    "mad",
-    "agentspec.reasoning.mad:MultiAgentDebate",
-    "agents answer, read each other's answers, answer again, and vote",
-    calls=CallProfile(step=(9, 18)),
-    rl=CallProfile(step=(4, 4)),
-    purposes=("argue", "act"),
-)
-register(
-    "reasoning",
-    "tot",
-    "agentspec.reasoning.tot:TreeOfThoughts",
-    "a tree of short action sequences: propose, judge, prune, breadth or depth first",
-    calls=CallProfile(step=(1, 20)),
-    rl=CallProfile(step=(1, 8)),
-    purposes=("propose", "value", "vote"),
-    needs=("n",),
-)
-register(
-    "reasoning",
-    "rap",
-    "agentspec.reasoning.rap:ReasoningViaPlanning",
-    "Monte-Carlo tree search with the model as world model and judge",
-    calls=CallProfile(step=(1, 91)),
-    rl=CallProfile(step=(1, 16)),
-    purposes=("propose", "world", "judge"),
-    needs=("n", "score"),
-    waived={"score": ("evaluation", "samples")},
-)
-register(
-    "reasoning",
-    "lats",
-    "agentspec.reasoning.lats:LanguageAgentTreeSearch",
-    "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
-    calls=CallProfile(step=(1, 1121)),
-    rl=CallProfile(step=(1, 20)),
-    purposes=("propose", "value", "reflect", "world"),
-    needs=("n", "snapshots"),
-    waived={"snapshots": ("world", "model")},
-)
-
-register("reflection", "none", "agentspec.reflection.none:NoReflection", "keeps every decision as it is")
-register(
-    "reflection",
-    "self_refine",
-    "agentspec.reflection.self_refine:SelfRefine",
-    "a critic's feedback on the action before it is executed, and another attempt, until it is content",
-    calls=CallProfile(step=(1, 6)),
-    rl=CallProfile(step=(1, 2)),
-    purposes=("feedback", "refine"),
-)
-register(
-    "reflection",
-    "reflexion",
-    "agentspec.reflection.reflexion:Reflexion",
-    "after a failed trial a lesson in words, shown in the next trials of the same task",
-    calls=CallProfile(episode=(0, 1)),
-    purposes=("reflect",),
-)
-register(
-    "reflection",
-    "retroformer",
-    "agentspec.reflection.retroformer:Retroformer",
-    "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
-    calls=CallProfile(episode=(0, 1)),
-    purposes=("reflect",),
-)
+    Raises:
+        SpecError: a module that is not there, or that fails when it is imported.
+    """
+    for name in names:
+        REGISTRY.add_module(import_module(name))
 
 
-def call_table(kinds: tuple[str, ...] = ("memory", "reasoning", "reflection")) -> str:
-    """The declared call profiles as a Markdown table, one row per module and preset: what the documentation shows."""
-    occasions = ("retrieve", "store", "step", "episode")
-    lines = [
-        "| kind | module | preset | " + " | ".join(f"calls per {o}" for o in occasions) + " | purposes | needs |",
-        "|---|---|---|" + "---|" * len(occasions) + "---|---|",
-    ]
-    for kind in kinds:
-        for name, entry in sorted(REGISTRY.entries.get(kind, {}).items()):
-            needs = [need + _waiver(entry, need) for need in entry.needs]
-            for preset, profile in (entry.presets or {"": entry.calls}).items():
-                counts = [_count(getattr(profile, occasion)) for occasion in occasions]
-                row = [kind, f"`{name}`", f"`{preset}`" if preset else "", *counts]
-                lines.append("| " + " | ".join([*row, ", ".join(entry.purposes), ", ".join(needs)]) + " |")
-    return "\n".join(lines) + "\n"
+def kind_of(cls: Any) -> Kind:
+    """What kind of module a class is, by its methods.
+
+    Raises:
+        SpecError: it is none, or several.
+    """
+    kinds = [kind for kind, methods in METHODS.items() if all(callable(getattr(cls, m, None)) for m in methods)]
+    if len(kinds) != 1:
+        wanted = "; ".join(f"{kind}: {', '.join(methods)}" for kind, methods in METHODS.items())
+        found = " and ".join(kinds) or "no module"
+        raise SpecError(f"{cls.__module__}:{cls.__name__} is {found}; a module has the methods of one kind ({wanted})")
+    return kinds[0]
 
 
-def _count(span: tuple[int, int]) -> str:
-    fewest, most = span
-    return str(most) if fewest == most else f"{fewest}–{most}"
+def snake_case(name: str) -> str:
+    """The class name `CheatSheet` as `cheat_sheet`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).casefold()
 
 
-def _waiver(entry: Entry, need: str) -> str:
-    if need not in entry.waived:
-        return ""
-    name, value = entry.waived[need]
-    return f" (not with `{name}: {value}`)"
+def _declared(module: ModuleType) -> Iterator[Any]:
+    """The classes that `module` itself defines and that have a declaration of their own."""
+    for value in list(vars(module).values()):
+        if inspect.isclass(value) and value.__module__ == module.__name__ and "declaration" in vars(value):
+            yield value
+
+
+def _from_path(kind: str, name: str) -> Entry:
+    """The entry of `package.module:Class`."""
+    module, _, attribute = name.partition(":")
+    cls = getattr(import_module(module), attribute, None)
+    if not inspect.isclass(cls):
+        classes = [v for v in vars(sys.modules[module]).values() if inspect.isclass(v)]
+        names = [c.__name__ for c in classes if c.__module__ == module]
+        raise SpecError(f"{kind} {name!r}: module {module!r} has no class {attribute!r}{suggest(attribute, names)}")
+    if kind_of(cls) != kind:
+        raise SpecError(f"{name} is a {kind_of(cls)} module; the spec names it as {kind}")
+    declaration = getattr(cls, "declaration", Declaration())
+    return Entry(name, declaration, declaration.name or snake_case(attribute))
+
+
+def _entry_points(kind: str) -> list[metadata.EntryPoint]:
+    return list(metadata.entry_points(group=ENVS_GROUP if kind == "env" else MODULES_GROUP))

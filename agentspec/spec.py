@@ -17,21 +17,27 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from agentspec.actions import suggest
 from agentspec.context import Context, Layout, Placement
+from agentspec.llm.helpers import check_helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.recorder import Budget, ModuleLLM, Recorder, derive_seed
+from agentspec.parameters import check_parameters, check_types
 from agentspec.protocols import Embedder, Services, StepClock
-from agentspec.registry import REGISTRY, SpecError
+from agentspec.registry import REGISTRY, SpecError, import_modules, snake_case
 from agentspec.types import Sampling
+
+if TYPE_CHECKING:
+    from agentspec.agent import Agent
 
 MODULE_KINDS = ("perception", "memory", "reasoning", "reflection")
 
@@ -58,20 +64,18 @@ class ModuleSpec:
             name, params = value["name"], {k: v for k, v in value.items() if k != "name"}
         else:
             raise SpecError(f"{kind}: expected a name or a mapping with 'name', got {value!r}")
-        accepted = _parameters(REGISTRY.get(kind, name).load())
-        for key in params:
-            if key not in accepted:
-                raise SpecError(f"{kind} {name!r} has no parameter {key!r}{suggest(key, accepted)}")
-        return cls(name, params)
+        entry = REGISTRY.get(kind, name)
+        check_parameters(f"{kind} {name!r}", entry.load(), params)
+        return cls(name if ":" in name else entry.name, params)
+
+    @property
+    def short(self) -> str:
+        """The name in tables and call tags: of `package.module:Class` the class's own."""
+        return self.name if ":" not in self.name else snake_case(self.name.partition(":")[2])
 
     def to_data(self) -> Any:
         """YAML-able: the bare name when there are no parameters."""
         return {"name": self.name, **self.params} if self.params else self.name
-
-
-def _parameters(target: Any) -> list[str]:
-    """Names of the keyword parameters of a module class (``services`` is the scaffold's)."""
-    return [p for p in inspect.signature(target).parameters if p != "services"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,10 @@ class AgentSpec:
     `scope` says whether memory lives for one `episode` (every episode starts empty) or for the whole `run`. What is
     recalled has at most `recall_tokens` tokens in a step, lessons of a reflector `lesson_tokens`; with `recall: newest`
     both stand in the newest user turn only, with `recall: kept` in every turn (see :mod:`agentspec.context`).
+
+    `embedder` names what turns text into vectors for the modules that need it. `roles` gives modules a helper model in
+    place of the policy: pattern over module names (`memory.*`) -> a backend (see :mod:`agentspec.llm.helpers`); its
+    calls are metered and never trained. `imports` brings in modules of your own (see :mod:`agentspec.registry`).
     """
 
     perception: ModuleSpec = ModuleSpec("generic")
@@ -93,7 +101,9 @@ class AgentSpec:
     recall: Placement = "newest"
     recall_tokens: int = 512
     lesson_tokens: int = 256
-    embedder: str = ""
+    embedder: str | Mapping[str, Any] = ""
+    roles: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    imports: tuple[str, ...] = ()
     sampling: Sampling = Sampling()
     budget: Budget = Budget()
 
@@ -112,21 +122,37 @@ class AgentSpec:
             if key not in _FIELDS:
                 raise SpecError(f"unknown key {key!r} in spec{suggest(str(key), _FIELDS)}")
         values: dict[str, Any] = dict(data)
+        if "imports" in values:
+            names = [values["imports"]] if isinstance(values["imports"], str) else values["imports"]
+            check_types("spec", cls, {"imports": names})
+            import_modules(names)
+            values["imports"] = tuple(names)
         for kind in MODULE_KINDS:
             if kind in values:
                 values[kind] = ModuleSpec.parse(kind, values[kind])
-        if "sampling" in values:
-            values["sampling"] = _dataclass(Sampling, values["sampling"], "sampling")
-        if "budget" in values:
-            values["budget"] = _dataclass(Budget, values["budget"], "budget")
+        for key, kept in (("sampling", Sampling), ("budget", Budget)):
+            if key in values:
+                values[key] = _dataclass(kept, values[key], key)
+        check_types("spec", cls, {k: v for k, v in values.items() if k in _PLAIN})
         spec = cls(**values)
-        if spec.layout not in ("conversation", "snapshot"):
-            raise SpecError(f"layout must be 'conversation' or 'snapshot', got {spec.layout!r}")
-        if spec.scope not in ("episode", "run"):
-            raise SpecError(f"scope must be 'episode' or 'run', got {spec.scope!r}")
-        if spec.recall not in ("newest", "kept"):
-            raise SpecError(f"recall must be 'newest' or 'kept', got {spec.recall!r}")
+        spec.validate()
         return spec
+
+    def validate(self) -> None:
+        """Refuse what cannot be built, whether or not it is going to be (a policy may bring reasoning of its own).
+
+        Raises:
+            SpecError: a value out of range, an unknown embedder or role, or a module that refuses its parameters.
+        """
+        for key, lowest in (("max_turns", 0), ("recall_tokens", 0), ("lesson_tokens", 0)):
+            if getattr(self, key) < lowest:
+                raise SpecError(f"{key} must be at least {lowest}, got {getattr(self, key)}")
+        self._check_roles()
+        if self.embedder:
+            from agentspec.embedding import check_embedder
+
+            check_embedder(self.embedder)
+        self._build(Recorder(NoLLM(), episode="", seed=0), None)
 
     @classmethod
     def from_yaml(cls, source: str | Path) -> AgentSpec:
@@ -138,6 +164,8 @@ class AgentSpec:
         data: dict[str, Any] = {kind: getattr(self, kind).to_data() for kind in MODULE_KINDS}
         data |= {k: getattr(self, k) for k in ("layout", "max_turns", "scope", "embedder")}
         data |= {k: getattr(self, k) for k in ("recall", "recall_tokens", "lesson_tokens")}
+        data |= {"roles": {k: dict(v) for k, v in self.roles.items()}} if self.roles else {}
+        data |= {"imports": list(self.imports)} if self.imports else {}
         for key in ("sampling", "budget"):
             value, default = getattr(self, key), type(getattr(self, key))()
             fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
@@ -153,9 +181,9 @@ class AgentSpec:
     @property
     def label(self) -> str:
         """Short name for tables: ``react+base``, with reflection and layout where they are not the default."""
-        parts = [self.reasoning.name, self.memory.name]
+        parts = [self.reasoning.short, self.memory.short]
         if self.reflection.name != "none":
-            parts.append(self.reflection.name)
+            parts.append(self.reflection.short)
         return "+".join(parts) + ("" if self.layout == "conversation" else f" ({self.layout})")
 
     def needs(self) -> set[str]:
@@ -166,14 +194,32 @@ class AgentSpec:
         module: ModuleSpec = getattr(self, kind)
         return REGISTRY.get(kind, module.name).needs_with(module.params)
 
+    def call_paths(self) -> list[str]:
+        """`module/purpose` paths of the calls that the modules may make, as patterns over calls match them."""
+        paths = []
+        for kind in MODULE_KINDS:
+            module: ModuleSpec = getattr(self, kind)
+            entry = REGISTRY.get(kind, module.name)
+            if entry.calls.calls_model:
+                paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
+        return paths
+
     def check(self, capabilities: frozenset[str], who: str) -> None:
         """Refuse a backend that lacks what a module needs.
+
+        Args:
+            capabilities: what is offered, `snapshots` by an environment and `embedder` by the caller included.
+            who: who offers it, e.g. `backend 'local'`.
 
         Raises:
             SpecError: naming the module, what it needs and the remedy.
         """
+        offered = capabilities | ({"embedder"} if self.embedder else frozenset())
         for kind in MODULE_KINDS:
-            missing = [n for n in self._needs_of(kind) if n not in capabilities]
+            missing = [n for n in self._needs_of(kind) if n not in offered]
+            if missing == ["embedder"]:
+                name = getattr(self, kind).name
+                raise SpecError(f"{kind} {name!r} needs an embedder; set `embedder: minilm` (or `hash`) in the spec")
             if missing:
                 entry = REGISTRY.get(kind, getattr(self, kind).name)
                 waivers = [f"set `{p}: {v}`" for p, v in (entry.waived[n] for n in missing if n in entry.waived)]
@@ -183,8 +229,20 @@ class AgentSpec:
                     f"(it offers {', '.join(sorted(capabilities)) or 'nothing of the kind'}); {remedy}"
                 )
 
-    def build(self, recorder: Recorder, *, embedder: Embedder | None = None) -> Any:
-        """A fresh :class:`~agentspec.agent.Agent` for one episode, its modules wired to ``recorder``."""
+    def build(self, recorder: Recorder, *, embedder: Embedder | None = None) -> Agent:
+        """A fresh :class:`~agentspec.agent.Agent` for one episode, its modules wired to `recorder`.
+
+        Args:
+            recorder: the episode's model calls.
+            embedder: in place of the one that the spec names.
+        """
+        if embedder is None and self.embedder:
+            from agentspec.embedding import embedder_of
+
+            embedder = embedder_of(self.embedder)
+        return self._build(recorder, embedder)
+
+    def _build(self, recorder: Recorder, embedder: Embedder | None) -> Agent:
         from agentspec.agent import Agent
 
         clock = StepClock()
@@ -203,19 +261,39 @@ class AgentSpec:
         for kind in MODULE_KINDS:
             spec: ModuleSpec = getattr(self, kind)
             cls = REGISTRY.get(kind, spec.name).load()
-            if kind == "perception":
-                modules[kind] = cls(**spec.params)
-                continue
-            path = f"{kind}.{spec.name}"
-            rng = random.Random(derive_seed(recorder.seed, path))
-            names[kind] = path
-            new_id = functools.partial(clock.new_id, path)
-            provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder, new_id))
-            modules[kind] = cls(provided[-1], **spec.params)
+            arguments: tuple[Any, ...] = ()
+            if kind != "perception":
+                path = names[kind] = f"{kind}.{spec.short}"
+                rng = random.Random(derive_seed(recorder.seed, path))
+                new_id = functools.partial(clock.new_id, path)
+                provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder, new_id))
+                arguments = (provided[-1],)
+            try:
+                modules[kind] = cls(*arguments, **spec.params)
+            except SpecError:
+                raise
+            except (TypeError, ValueError) as error:
+                raise SpecError(f"{kind} {spec.name!r}: {error}") from error
         return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
+
+    def helped(self, pattern: str) -> list[str]:
+        """The modules that a pattern of `roles` names."""
+        return [module for module in self._modules() if fnmatchcase(module, pattern)]
+
+    def _modules(self) -> list[str]:
+        return [f"{kind}.{getattr(self, kind).short}" for kind in MODULE_KINDS[1:]]
+
+    def _check_roles(self) -> None:
+        """Refuse roles of no module, and backends that say neither what nor where."""
+        for pattern, backend in self.roles.items():
+            if not self.helped(pattern):
+                modules = ", ".join(self._modules())
+                raise SpecError(f"roles: {pattern!r} matches none of the modules {modules}")
+            check_helper(f"roles: {pattern!r}", backend)
 
 
 _FIELDS = [f.name for f in dataclasses.fields(AgentSpec)]
+_PLAIN = ("layout", "max_turns", "scope", "recall", "recall_tokens", "lesson_tokens", "embedder", "roles")
 
 
 def _dataclass(cls: Any, value: Any, where: str) -> Any:
@@ -228,6 +306,7 @@ def _dataclass(cls: Any, value: Any, where: str) -> Any:
     for key in value:
         if key not in names:
             raise SpecError(f"unknown key {key!r} in {where}{suggest(str(key), names)}")
+    check_types(where, cls, value)
     try:
         return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in value.items()})
     except (TypeError, ValueError) as error:

@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from agentspec import __version__
 from agentspec.files import jsonable, write_atomic
 from agentspec.tokens import shared_prefix
 from agentspec.types import (
@@ -133,8 +134,8 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    found = {}
-    for name in ("agentspec", "gymnasium", "numpy", "torch", "transformers"):
+    found = {"agentspec": __version__}
+    for name in ("gymnasium", "numpy", "torch", "transformers"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

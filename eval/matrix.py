@@ -22,6 +22,7 @@ from agentspec.actions import suggest
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
+from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, jsonable, write_trajectories
@@ -182,6 +183,7 @@ async def _play(
             max_steps=settings.max_steps,
             prices=settings.prices,
             policy=setting.policy.name,
+            progress=episode_progress,
             on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
         )
         if setting.spec.scope == "run":

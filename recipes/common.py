@@ -8,7 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from agentspec.cli.ours import claim_packages
+
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+
+claim_packages()
 
 CONFIGS = Path(__file__).parent / "configs"
 

@@ -26,6 +26,8 @@ def train_warmup(config: Any) -> None:
     from datasets import Dataset
     from trl import SFTConfig
 
+    from agentspec.files import write_atomic
+    from trainers.card import model_card
     from trainers.config import CHECKPOINTING
     from trainers.demonstrations import DemonstrationTrainer, demonstrate
     from trainers.policy import load_policy
@@ -59,6 +61,8 @@ def train_warmup(config: Any) -> None:
     trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()
     trainer.save_model(config.output_dir)
+    card = model_card(Path(config.output_dir).name, vars(config), config.spec.to_data(), adapter=bool(config.lora_r))
+    write_atomic(Path(config.output_dir) / "README.md", card)
     log = RunLog(Path(config.output_dir))
     log.manifest(config=config.to_dict(), spec=config.spec.to_data(), demonstrations=len(returns))
 

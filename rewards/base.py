@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -26,9 +28,24 @@ class RewardEntry:
     summary: str
 
     def load(self) -> Reward:
-        """Import the function."""
+        """Import the function. The working directory counts, after everything that is installed.
+
+        Raises:
+            SpecError: there is no such module, or no function of that name in it.
+        """
         module, _, name = self.target.partition(":")
-        reward: Reward = getattr(importlib.import_module(module), name)
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())
+        try:
+            reward: Reward = getattr(importlib.import_module(module), name)
+        except ModuleNotFoundError as error:
+            if error.name != module:
+                raise
+            raise SpecError(
+                f"reward {self.target!r}: no module {module!r}; install it, or start where it lies"
+            ) from None
+        except AttributeError:
+            raise SpecError(f"reward {self.target!r}: there is no {name!r} in the module {module!r}") from None
         return reward
 
 
@@ -68,19 +85,27 @@ class Score:
         return {name: math.fsum(values) for name, values in self.terms.items()}
 
 
+def reward_entry(name: str) -> RewardEntry:
+    """The entry of a registered name; of `module:function`, an entry for that function.
+
+    Raises:
+        SpecError: neither, with the nearest names.
+    """
+    if name not in REWARDS and ":" not in name:
+        raise SpecError(f"unknown reward {name!r}{suggest(name, REWARDS)}")
+    return REWARDS.get(name) or RewardEntry(name, "from outside this package")
+
+
 class RewardSet:
     """A weighted sum of rewards.
 
     Args:
-        weights: registered name -> weight. Default: `earning_delta` alone.
+        weights: registered name, or `module:function`, -> weight. Default: `earning_delta` alone.
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
         self.weights = dict(weights or {"earning_delta": 1.0})
-        for name in self.weights:
-            if name not in REWARDS:
-                raise SpecError(f"unknown reward {name!r}{suggest(name, REWARDS)}")
-        self._functions = {name: REWARDS[name].load() for name in self.weights}
+        self._functions = {name: reward_entry(name).load() for name in self.weights}
 
     def score(self, trajectory: Trajectory) -> Score | None:
         """What the episode earned, every tuple as long as the episode; `None` if it failed and cannot be scored.

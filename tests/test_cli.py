@@ -159,6 +159,27 @@ def test_bad_input_is_one_line_with_a_remedy(tmp_path: Path, capsys: pytest.Capt
             assert part in message, (argv, message)
 
 
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("budget: {calls: many}", "many"),
+        ("max_turns: x", "max_turns"),
+        ("embedder: nonsense", "nonsense"),
+        ("reasoning: {name: tot, preset: wrong}", "wrong"),
+        ("memory: {name: base, window: many}", "window"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "eval"])
+def test_a_spec_is_validated_whole_whoever_plays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, spec: str, message: str
+) -> None:
+    """Also where a scripted policy takes the place of the reasoning that is wrong."""
+    out = str(tmp_path / "out")
+    rest = ["--policy", "random", "--spec", spec] if command == "run" else ["--policies", "random", "--specs", spec]
+    assert message in refused(capsys, command, "--env", TOY, *rest, "--out", out)
+    assert not Path(out).exists()
+
+
 def test_a_missing_model_names_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -201,7 +222,7 @@ def test_a_value_error_is_expected_when_our_code_raised_it() -> None:
 
 def test_one_line() -> None:
     assert one_line(SpecError("a\n  b")) == "a b"
-    assert one_line(ModuleNotFoundError("No module named 'peft'", name="peft.x")).endswith("'agentspec[train]'")
+    assert one_line(ModuleNotFoundError("No module named 'peft'", name="peft.x")).endswith("'agentspec-rl[train]'")
     assert one_line(FileNotFoundError(2, "No such file or directory", "x.yaml")).startswith("x.yaml: No such file")
     with pytest.raises(SystemExit):
         fail("plain text")

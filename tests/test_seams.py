@@ -184,3 +184,73 @@ def test_an_experience_that_was_not_possible_says_so() -> None:
     broken = Decision(ActionError("SYNTAX", "no call", "hm"))
     seen = AgentInput("", "", ActionSchema({}))
     assert not Experience.of(Transition(0, seen, broken, "hm", 0.0, "")).ok
+
+
+HELPED = {
+    "reasoning": "direct",
+    "memory": "summary",
+    "roles": {"memory.*": {"backend": "scripted", "script": ["What the helper wrote."]}},
+}
+
+
+def test_a_helper_answers_its_modules_is_metered_and_never_trained() -> None:
+    from trainers.sequences import TrainFilter, build_sequences
+
+    asked: list[str] = []
+
+    def policy(request: Request) -> str:
+        asked.append(request.tag.module)
+        return "WAIT()"
+
+    spec = AgentSpec.from_data(HELPED)
+    assert AgentSpec.from_data(spec.to_data()) == spec
+    (trajectory,) = Runner(spec, ScriptedLLM(policy)).run([Job(Task(TOY, 0, {"steps": 10}))])
+    (summary,) = [c for c in trajectory.calls if c.tag.purpose == "summary"]
+    assert set(asked) == {"reasoning.direct"} and summary.text == "What the helper wrote."
+    assert b"What the helper wrote." in bytes(i for i in trajectory.calls[-1].prompt_ids if i < 256)
+    assert trajectory.metrics["llm_calls"] == 11
+    rows = build_sequences(trajectory, TrainFilter(("*",), ("executed", "aux")))
+    assert rows and all(summary.id not in row.calls for row in rows)
+    # The policy's own summary is trained.
+    own = AgentSpec.from_data({k: v for k, v in HELPED.items() if k != "roles"})
+    (trajectory,) = Runner(own, ScriptedLLM(policy)).run([Job(Task(TOY, 0, {"steps": 10}))])
+    (summary,) = [c for c in trajectory.calls if c.tag.purpose == "summary"]
+    rows = build_sequences(trajectory, TrainFilter(("*",), ("executed", "aux")))
+    assert any(summary.id in row.calls for row in rows)
+
+
+def test_recall_in_the_newest_turn_makes_a_row_per_step_and_every_action_is_trained_once() -> None:
+    from trainers.sequences import build_sequences
+
+    rows = {}
+    for placement in ("newest", "kept"):
+        (played,) = play(steps=6, memory={"name": "base", "window": 3}, recall=placement)
+        rows[placement] = build_sequences(played)
+        trained = sorted(c for row in rows[placement] for c, m in zip(row.calls, row.mask, strict=True) if m)
+        # Six actions of "WAIT()" and the end of the turn: 7 tokens each, none twice, none lost.
+        assert len(trained) == 6 * 7 and sorted(set(trained)) == [c.id for c in played.calls]
+        longest = max(len(c.prompt_ids) for c in played.calls)
+        rows[placement, "longest"] = longest
+    # Nothing is recalled in the first step, so the second prompt extends the first: one row of two actions, and one of
+    # one action for each of the four prompts after it.
+    assert len(rows["kept"]) == 1 and len(rows["newest"]) == 5
+    assert rows["newest", "longest"] < rows["kept", "longest"]
+
+
+def test_an_embedder_that_is_needed_must_be_named() -> None:
+    from agentspec.declaration import Declaration
+    from agentspec.registry import REGISTRY, Entry, SpecError
+
+    REGISTRY.register("memory", "near", Entry("agentspec.memory.base:BaseMemory", Declaration(needs=("embedder",))))
+    try:
+        spec = AgentSpec.from_data({"memory": "near"})
+        with pytest.raises(SpecError, match="needs an embedder; set `embedder: minilm`"):
+            Runner(spec, ScriptedLLM(["WAIT()"])).run([Job(Task(TOY, 0))])
+        REGISTRY.unregister("memory", "near")
+        spec = AgentSpec.from_data({"memory": "base", "embedder": {"name": "hash", "dim": 16}})
+        from agentspec.llm.recorder import Recorder
+
+        agent = spec.build(Recorder(ScriptedLLM(["x"]), episode="e", seed=0))
+        assert agent.services[0].embedder is not None and agent.services[0].embedder.dim == 16
+    finally:
+        REGISTRY.unregister("memory", "near")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from agentspec.registry import REGISTRY, Entry, Registry, SpecError
+from agentspec.declaration import Declaration
+from agentspec.registry import REGISTRY, Entry, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
 
 
@@ -43,24 +44,53 @@ def test_missing_file() -> None:
 
 
 def test_needs_are_checked_before_a_run() -> None:
-    REGISTRY.register("reasoning", "scorer", Entry("agentspec.reasoning.direct:Direct", needs=("score",)))
+    REGISTRY.register("reasoning", "scorer", Entry("agentspec.reasoning.direct:Direct", Declaration(needs=("score",))))
     try:
         spec = AgentSpec.from_data({"reasoning": "scorer"})
         with pytest.raises(SpecError, match="needs score, which backend x does not offer"):
             spec.check(frozenset({"choices"}), "backend x")
         spec.check(frozenset({"score"}), "backend x")
     finally:
-        del REGISTRY.entries["reasoning"]["scorer"]
-
-
-def test_names_cannot_be_taken_over() -> None:
-    registry = Registry()
-    registry.register("memory", "a", Entry("m:A"))
-    registry.register("memory", "a", Entry("m:A"))
-    with pytest.raises(SpecError, match="already registered"):
-        registry.register("memory", "a", Entry("m:B"))
+        REGISTRY.unregister("reasoning", "scorer")
 
 
 @pytest.mark.parametrize(("kind", "name"), [(k, n) for k in MODULE_KINDS for n in REGISTRY.entries[k]])
 def test_every_registered_module_can_be_imported(kind: str, name: str) -> None:
     assert callable(REGISTRY.get(kind, name).load())
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"budget": {"calls": "many"}}, "budget: calls must be a whole number or null, got 'many'"),
+        ({"budget": {"cost": True}}, "budget: cost must be a number or null"),
+        ({"sampling": {"temperature": "hot"}}, "sampling: temperature must be a number"),
+        ({"max_turns": "x"}, "max_turns must be a whole number, got 'x'"),
+        ({"max_turns": -1}, "max_turns must be at least 0"),
+        ({"recall_tokens": 1.5}, "recall_tokens must be a whole number"),
+        ({"recall": "sometimes"}, "recall must be 'newest' or 'kept'"),
+        ({"scope": ["run"]}, "scope must be 'episode' or 'run'"),
+        ({"embedder": "minilmm"}, "unknown embedder 'minilmm'"),
+        ({"reasoning": {"name": "mad", "preset": "papper"}}, "mad has no preset 'papper'; did you mean paper"),
+        ({"reasoning": {"name": "tot", "breadth": "wide"}}, "reasoning 'tot': breadth must be"),
+        ({"memory": {"name": "base", "window": 0}}, "memory 'base': memory base: window must be at least 1"),
+        ({"memory": {"name": "base", "window": True}}, "memory 'base': window must be a whole number"),
+        ({"memory": {"name": "base", "windw": 1}}, "has no parameter 'windw'; did you mean window"),
+        ({"perception": {"name": "generic", "images": "yes"}}, "images must be true or false"),
+        ({"roles": {"memory.*": {"adapter": "x"}}}, "roles: 'memory.\\*': expected {model: NAME}"),
+        ({"roles": {"reflection.mad": {"model": "x"}}}, "matches none of the modules"),
+        ({"roles": {"memory.*": {"model": "x", "endpoint": "u", "adapter": "a"}}}, "leave `adapter` out"),
+        ({"imports": [3]}, "imports must be a list"),
+    ],
+)
+def test_a_spec_is_checked_whole(data: dict, message: str) -> None:
+    with pytest.raises(SpecError, match=message.replace("{", r"\{").replace("}", r"\}")):
+        AgentSpec.from_data(data)
+
+
+def test_a_module_that_a_policy_replaces_is_checked_all_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    from agentspec.cli import main
+
+    with pytest.raises(SystemExit):
+        main(["run", "--policy", "rule-based", "--spec", "reasoning: {name: lats, preset: cheap}"])
+    assert "lats has no preset 'cheap'" in capsys.readouterr().err

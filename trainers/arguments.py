@@ -28,8 +28,8 @@ EXTENDS = "extends"
 OURS = {
     "model": "model adapter actor_adapter actor_temperature lora_r lora_alpha lora_targets lora_layers",
     "agent and world": "agent environment train_tasks memory_carry retries env_timeout_s rollout_concurrency batching",
-    "credit and loss": "train_calls train_credits rewards estimator gamma gigpo_weight skip_zero_variance normalize "
-    "overlong overlong_ends mask_truncated packing tokens_per_forward",
+    "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
+    "normalize overlong overlong_ends mask_truncated packing tokens_per_forward",
     "evaluation": "eval_tasks eval_specs eval_sampling validation_tasks validation_specs",
     "this run": "resume plots",
 }

@@ -22,6 +22,7 @@ from agentspec.files import write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
 from agentspec.registry import SpecError
 from agentspec.trajectory import versions
+from trainers.card import model_card
 from trainers.run_folder import checkpoints
 from trainers.runlog import RunLog
 
@@ -83,6 +84,16 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
             _name_base(work / ADAPTER_CONFIG, base)
         _tokenizer(trained.folder, base, work)
         manifest = _manifest(run, trained, base, work, merged=merge and trained.adapter)
+        config = {"model": manifest["base_model"]["name"], "environment": manifest["environment"]}
+        card = model_card(
+            to.name,
+            {**_recorded(run), **config},
+            manifest["scaffold"],
+            adapter=trained.adapter and not merge,
+            note=f"{manifest['kind']}, from the run's {manifest['source']}",
+        )
+        write_atomic(work / "README.md", card)
+        manifest["files"] = {path.name: _sha256(path) for path in sorted(work.iterdir())}
         write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
         _make_readable(work)
         os.replace(work, to)  # onto an empty folder or nothing
@@ -220,7 +231,6 @@ def _manifest(run: Path, trained: Trained, base: ModelSource | None, work: Path,
         "tokenizer_sha256": _sha256(work / "tokenizer.json") if (work / "tokenizer.json").is_file() else "",
         "versions": {"export": versions() | _more_versions(), "training": recorded.get("versions", {})},
         "rewards": reward_summary(RunLog(run).read("metrics.jsonl")),
-        "files": {path.name: _sha256(path) for path in sorted(work.iterdir())},
     }
 
 
@@ -256,9 +266,13 @@ def _run_manifest(run: Path) -> dict[str, Any]:
 
 def _configured(run: Path, name: str) -> Any:
     """A setting of the run, from its manifest."""
-    manifest = _run_manifest(run)
-    config = manifest.get("config")
-    return manifest.get(name) or (config.get(name) if isinstance(config, dict) else None)
+    return _run_manifest(run).get(name) or _recorded(run).get(name)
+
+
+def _recorded(run: Path) -> dict[str, Any]:
+    """The run's configuration, as its manifest has it; empty without one."""
+    config = _run_manifest(run).get("config")
+    return config if isinstance(config, dict) else {}
 
 
 def _revision(base: ModelSource | None) -> str:

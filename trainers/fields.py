@@ -3,13 +3,12 @@
 A field that nobody reads would be a setting without effect, so each one is *used* (by TRL, transformers, accelerate or
 this package), *fixed* (only one value is exact here), or *refused* with the place where it is set instead. A test
 compares this table with the installed TRL: a version that adds a field fails it until the field has its row.
-`python -m trainers.fields` writes `docs/training_fields.md` from it.
+`docs/update_training_fields.py` writes the page of the documentation from it.
 """
 
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, fields
-from importlib.metadata import version
 from typing import Any, Literal
 
 
@@ -130,39 +129,3 @@ def field_rules(config: type) -> dict[str, FieldRule]:
             allowed = (default.get(name), *ALSO_ALLOWED.get(name, ()))
             rules[name] = FieldRule("refused", why, allowed)
     return rules
-
-
-def page(config: type) -> str:
-    """The table as Markdown, in the order in which the dataclass declares its fields."""
-    rules = field_rules(config)
-    names = [f.name for f in fields(config)]
-    count = {status: sum(rules[n].status == status for n in names) for status in ("used", "fixed", "refused")}
-    return "\n".join(
-        [
-            "# Fields of a training configuration",
-            "",
-            "`ScaffoldConfig` is `trl.GRPOConfig` plus our own fields (described in `trainers/config.py`). Every",
-            "inherited field is used, fixed to the one value that is exact here, or refused with what to set instead.",
-            f"TRL {version('trl')}: {', '.join(f'{n} {status}' for status, n in count.items())}.",
-            "Generated from `trainers/fields.py` by `python -m trainers.fields`.",
-            "",
-            "| field | | |",
-            "|---|---|---|",
-            *(f"| `{n}` | {rules[n].status} | {_note(rules[n])} |" for n in names),
-            "",
-        ]
-    )
-
-
-def _note(rule: FieldRule) -> str:
-    return f"{rule.allowed[0]!r}: {rule.why}" if rule.status == "fixed" else rule.why
-
-
-if __name__ == "__main__":
-    from pathlib import Path
-
-    from trl import GRPOConfig
-
-    from agentspec.files import write_atomic
-
-    write_atomic(Path(__file__).resolve().parents[1] / "docs" / "training_fields.md", page(GRPOConfig))

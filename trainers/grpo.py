@@ -21,9 +21,11 @@ from trl.trainer.utils import use_adapter
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
+from agentspec.progress import episode_progress
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
+from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained, is_sharded
@@ -43,7 +45,7 @@ from trainers.validation import validate, validation_scaffolds
 from trainers.vllm import importance_ratio, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -146,6 +148,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, GRPOTrainer):
             make_env=self._make_env,
             concurrency=self.args.rollout_concurrency or None,
             timeout_s=self.args.env_timeout_s,
+            progress=episode_progress if self.accelerator.is_main_process else None,
             policy=f"step-{self.state.global_step}",
         )
 

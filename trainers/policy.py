@@ -92,11 +92,12 @@ def _load_base(config: ScaffoldConfig) -> tuple[nn.Module, Any, str]:
     """Model, tokenizer and where they came from."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
-    from agentspec.llm.models import resolve
+    from agentspec.llm.models import quiet, resolve
 
     path = resolve(config.model).path
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
-    return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
+    with quiet():
+        return AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path), path
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
-from transformers import TrainerCallback
+from transformers import ProgressCallback, TrainerCallback
 
 from agentspec.trajectory import Trajectory
 
@@ -32,6 +32,13 @@ def episode_lines(trajectory: Trajectory, most: int = 8) -> list[str]:
     lines = [f"    {t.step + 1:>3}  {t.action_text[:60]:<60} {t.reward:+.2f}" for t in trajectory.transitions[:most]]
     rest = len(trajectory.transitions) - most
     return [*lines, f"         ... {rest} more steps"] if rest > 0 else lines
+
+
+class Bar(ProgressCallback):
+    """The progress bar without the dictionary that transformers prints with every log: a report says it in a line."""
+
+    def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **_: Any) -> None:
+        """Nothing."""
 
 
 class TerminalReport(TrainerCallback):

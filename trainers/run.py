@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from datasets import Dataset
+from transformers import PrinterCallback, ProgressCallback
 
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
 from trainers.folder_lock import hold
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
-from trainers.report import TerminalReport
+from trainers.report import Bar, TerminalReport
 from trainers.rollouts import make_tasks, task_rows
 from trainers.run_folder import last_complete_checkpoint
 
@@ -44,6 +46,8 @@ def train(
         SpecError: the configuration cannot work, or another run is writing into its folder.
         KeyboardInterrupt: after a line that says how to go on.
     """
+    # Deprecations between libraries: nothing that whoever trains could change.
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(transformers|trl|peft|accelerate|datasets)\b")
     config.check()
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None
@@ -59,6 +63,9 @@ def train(
         processing_class=tokenizer,
         callbacks=list(callbacks),
     )
+    if trainer.pop_callback(ProgressCallback):
+        trainer.add_callback(Bar)
+    trainer.remove_callback(PrinterCallback)
     trainer.add_callback(TerminalReport(lambda: trainer.last_episodes))
     say = print if trainer.accelerator.is_main_process else _silent
     for note in notes(config):

@@ -25,11 +25,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit code. Errors of the input end the process with code 2 instead (``SystemExit``).
     """
+    from agentspec.cli.ours import claim_packages
     from agentspec.cli.parser import build_parser
+    from agentspec.registry import import_modules
 
     arguments = build_parser().parse_args(argv)
     with expected_errors():
+        claim_packages()
         try:
+            import_modules(arguments.imports)
             code: int = arguments.command(arguments)
             sys.stdout.flush()
             return code

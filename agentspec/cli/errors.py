@@ -17,6 +17,8 @@ from agentspec.llm.base import LLMError
 from agentspec.registry import SpecError
 
 PROGRAM = "agentspec"
+DISTRIBUTION = "agentspec-rl"
+"""Its name for pip: `agentspec` is another project there."""
 
 OURS = ("agentspec", "trainers", "rewards", "eval", "recipes")
 """Packages whose ``ValueError`` is a check of the input; one that numpy or torch raises keeps its traceback."""
@@ -36,6 +38,8 @@ EXTRAS = {
     "matplotlib": "train",
     "httpx": "openai",
     "minigrid": "minigrid",
+    "tensorboard": "tensorboard",
+    "wandb": "wandb",
 }
 """Packages that an extra of this one installs."""
 
@@ -74,7 +78,9 @@ def one_line(error: BaseException | str) -> str:
     """The message of an error on one line, with what to do."""
     if isinstance(error, ModuleNotFoundError) and _package(error) in EXTRAS:
         package = _package(error)
-        text = f"this needs the package {package}, which is not installed; pip install 'agentspec[{EXTRAS[package]}]'"
+        text = (
+            f"this needs the package {package}, which is not installed; pip install '{DISTRIBUTION}[{EXTRAS[package]}]'"
+        )
     elif isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror or type(error).__name__}; check the path"
     elif isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:

@@ -27,10 +27,19 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for module in (run, evaluate, export, audit, listing, view):
         module.add_parser(commands)
+    for command in set(commands.choices.values()):
+        command.add_argument(
+            "--import",
+            dest="imports",
+            action="append",
+            default=[],
+            metavar="MODULE|FILE",
+            help="bring in modules and environments of your own: a Python module or file (repeatable)",
+        )
     return parser
 
 
 def _version() -> str:
-    from importlib import metadata
+    from agentspec import __version__
 
-    return f"{PROGRAM} {metadata.version(PROGRAM)}"
+    return f"{PROGRAM} {__version__}"

@@ -17,10 +17,11 @@ from agentspec.cli.arguments import (
     load_prices,
     parse_policy,
 )
+from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, write_trajectories
-from agentspec.types import Task
+from agentspec.types import Task, Transition
 
 if TYPE_CHECKING:
     from eval.policies import Policy
@@ -71,6 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
     # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
     make_env(tasks[0]).close()
     film = Film(arguments.gif, tasks[0]) if arguments.gif else None
+    plays_model = policy is not None and not policy.scripted
+    if policy and plays_model and policy.settings()["backend"] == "local":
+        sys.stderr.write(f"loading {policy.name} ...\n")
     runner = Runner(
         spec,
         policy.build() if policy else None,
@@ -81,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         prices=load_prices(arguments.prices),
         policy=policy.name if policy else spec.reasoning.name,
         on_done=None if arguments.json else _print_outcome,
+        on_step=_print_step if plays_model else None,
+        progress=episode_progress,
     )
     trajectories = runner.run([Job(task) for task in tasks])
     if arguments.out:
@@ -120,6 +126,14 @@ def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
             raise SpecError(f"--adapter belongs to a model, and {arguments.policy} is none; leave it out")
         policy = replace(policy, adapter=arguments.adapter)
     return policy, policy.apply(spec)
+
+
+def _print_step(task: Task, transition: Transition) -> None:
+    """One line on stderr about a step that a model took, as it takes it."""
+    flag = "" if transition.decision.valid else " (invalid)"
+    reward = f" {transition.reward:+.2f}" if transition.reward else ""
+    text = " ".join(transition.action_text.split())[:80]
+    print(f"seed {task.seed} step {transition.step}: {text}{flag}{reward}", file=sys.stderr, flush=True)
 
 
 def _print_outcome(trajectory: Trajectory) -> None:

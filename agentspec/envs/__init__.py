@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from agentspec.registry import register
+
 if TYPE_CHECKING:
     from agentspec.envs.contract import ContractError, check_environment
     from agentspec.envs.making import environment_id, make_env
@@ -46,3 +48,9 @@ def __getattr__(name: str) -> Any:
 
 
 register_all()
+register(
+    "env",
+    "deliverybench",
+    "agentspec/DeliveryBench-v0",
+    "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+)

@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, Protocol
 
+from agentspec.registry import SpecError
+
 Factory = Callable[..., "Player"]
 
 
@@ -35,7 +37,7 @@ class Player(Protocol):
         ...
 
 
-class NoPlayer(ValueError):  # noqa: N818 - read as a sentence in the message of a run
+class NoPlayer(SpecError):  # noqa: N818 - read as a sentence in the message of a run
     """An environment that has no player of this role."""
 
 

@@ -14,9 +14,9 @@ from agentspec.actions import suggest
 from agentspec.llm.base import LLM, LLMError
 
 _BACKENDS = {
-    "local": ("agentspec.llm.local", "LocalLLM.load", "name_or_path", "agentspec[train]"),
-    "openai": ("agentspec.llm.openai", "OpenAILLM", "model", "agentspec[openai]"),
-    "scripted": ("agentspec.llm.scripted", "ScriptedLLM", "script", "agentspec"),
+    "local": ("agentspec.llm.local", "LocalLLM.load", "name_or_path", "'agentspec-rl[train]'"),
+    "openai": ("agentspec.llm.openai", "OpenAILLM", "model", "'agentspec-rl[openai]'"),
+    "scripted": ("agentspec.llm.scripted", "ScriptedLLM", "script", "agentspec-rl"),
 }
 # A spec is recorded with every run; a secret must not be in it.
 _SECRET = "api_key"

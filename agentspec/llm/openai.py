@@ -75,6 +75,7 @@ class OpenAILLM:
             raise ValueError(f"unknown server {server!r}; expected 'openai' or 'vllm'")
         if choices not in ("structured_outputs", "guided_choice"):
             raise ValueError(f"unknown way of choices {choices!r}; expected 'structured_outputs' or 'guided_choice'")
+        import_httpx()
         self.name = model
         self.max_context = max_context
         self.base_url = (base_url or os.environ.get("OPENAI_BASE_URL") or _DEFAULT_URL).rstrip("/")
@@ -272,7 +273,7 @@ def import_httpx() -> Any:
     try:
         import httpx
     except ImportError:
-        raise LLMError("the `openai` backend needs httpx; run `pip install agentspec[openai]`") from None
+        raise LLMError("the `openai` backend needs httpx; run `pip install 'agentspec-rl[openai]'`") from None
     return httpx
 
 

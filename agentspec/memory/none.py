@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from agentspec.declaration import Declaration
 from agentspec.protocols import Services
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, Task, Transition
@@ -9,6 +10,10 @@ from agentspec.types import AgentInput, Recall, Task, Transition
 
 class NoMemory:
     """Stores nothing and recalls nothing."""
+
+    declaration = Declaration(
+        "remembers nothing",
+    )
 
     def __init__(self, services: Services) -> None:
         self.services = services

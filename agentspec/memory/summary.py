@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, user
 from agentspec.memory.base import describe
 from agentspec.protocols import Services
@@ -37,6 +38,13 @@ class SummaryMemory:
             and the episode ends there.
         summary_tokens: most tokens of a summary.
     """
+
+    declaration = Declaration(
+        "SUPO: the policy's own summary replaces the conversation every 8 actions",
+        calls=CallProfile(store=(0, 1)),
+        purposes={"summary": Purpose("store", example="Took two orders; the first is delivered.")},
+        small=({"every": 3}, {"every": 0, "threshold_tokens": 300}),
+    )
 
     def __init__(
         self,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from agentspec.declaration import Declaration
 from agentspec.perception.generic import GenericPerception
 
 
 class DeliveryBenchPerception(GenericPerception):
     """Image, Instruction, State Info and Action Schema of a DeliveryBench observation (see `GenericPerception`)."""
+
+    declaration = Declaration("the four components of DeliveryBench: image, instruction, state, action schema")

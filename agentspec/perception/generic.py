@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from agentspec.declaration import Declaration
+from agentspec.registry import SpecError
 from agentspec.types import AgentInput, Task
 
 NEEDED = ("instruction", "action_schema", "state")
@@ -21,6 +23,8 @@ class GenericPerception:
         images: pass the observation's `image` on, for models that see.
     """
 
+    declaration = Declaration("image, instruction, state and action schema of any environment that keeps the contract")
+
     def __init__(self, images: bool = False) -> None:
         self.images = images
 
@@ -28,17 +32,17 @@ class GenericPerception:
         """u_t of one observation.
 
         Raises:
-            ValueError: the environment does not keep the contract, or has no picture where one is asked for.
+            SpecError: the environment does not keep the contract, or has no picture where one is asked for.
         """
         missing = [f"info[{name!r}]" for name in NEEDED if name not in info]
         missing += [] if "text" in observation else ["observation['text']"]
         if missing:
-            raise ValueError(
+            raise SpecError(
                 f"{task.env} does not report {', '.join(missing)}; hold it against the contract with "
                 "agentspec.envs.check_environment"
             )
         if self.images and "image" not in observation:
-            raise ValueError(
+            raise SpecError(
                 f"perception: {{images: true}}, but {task.env} shows no picture; turn it on in the environment's "
                 "options (`images: true`, or `render_mode: rgb_array`), or leave images out"
             )

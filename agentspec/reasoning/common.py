@@ -8,14 +8,16 @@ it is free text that the parser reads.
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
-from agentspec.actions import parse_action, suggest
+from agentspec.actions import parse_action
 from agentspec.llm.base import Message, user
+from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
-from agentspec.registry import SpecError
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, Sampled, Task, Transition
+
+__all__ = ["at_least", "one_of", "settings"]
 
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
 CALL_ANSWER = "Answer with exactly one action call and nothing else."
@@ -94,43 +96,6 @@ def clip(text: str, budget: int, services: Services, *, keep: str = "head") -> s
         room = min(len(text) - 1, len(text) * budget // used)
         text = text[:room] if keep == "head" else text[len(text) - room :]
     return text
-
-
-def settings(method: str, presets: Mapping[str, Mapping[str, Any]], preset: str, given: Mapping[str, Any]) -> Any:
-    """The parameters of ``preset``, replaced by those that were given (are not ``None``).
-
-    Raises:
-        SpecError: no such preset.
-    """
-    if preset not in presets:
-        raise SpecError(f"{method} has no preset {preset!r}{suggest(str(preset), presets)}")
-    chosen = dict(presets[preset])
-    for name, value in given.items():
-        if value is not None:
-            chosen[name] = value
-    return chosen
-
-
-def at_least(method: str, lowest: int, **values: int | None) -> None:
-    """Refuse counts that are too small (``None`` is no limit).
-
-    Raises:
-        SpecError: naming the parameter.
-    """
-    for name, value in values.items():
-        if value is not None and value < lowest:
-            raise SpecError(f"{method}: {name} must be at least {lowest}, got {value}")
-
-
-def one_of(method: str, **values: tuple[str, tuple[str, ...]]) -> None:
-    """Refuse a value that is none of its alternatives: ``name=(value, alternatives)``.
-
-    Raises:
-        SpecError: naming the parameter and what it may be.
-    """
-    for name, (value, allowed) in values.items():
-        if value not in allowed:
-            raise SpecError(f"{method}: {name} must be one of {', '.join(allowed)}; got {value!r}")
 
 
 def sampled(call: LLMCall, completion: int = 0) -> Sampled:

@@ -8,6 +8,7 @@ chains do stay in the conversation, as sampled.
 from __future__ import annotations
 
 from agentspec.actions import parse_action
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import assistant, user
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -35,6 +36,12 @@ class ChainOfThought(Stateless):
         thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
         enable_history: keep the chains in the conversation.
     """
+
+    declaration = Declaration(
+        "thinks step by step, then acts; the chain is not carried on",
+        calls=CallProfile(step=(1, 2)),
+        purposes=Purpose.each("step", "think", "act"),
+    )
 
     def __init__(
         self,

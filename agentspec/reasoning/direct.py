@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless, ask_action, default_answer, sampled, static_prompt, user_turn
 from agentspec.types import Action, AgentInput, Decision, Recall
@@ -9,6 +10,12 @@ from agentspec.types import Action, AgentInput, Decision, Recall
 
 class Direct(Stateless):
     """Answers with the action only."""
+
+    declaration = Declaration(
+        "answers with the action only",
+        calls=CallProfile(step=(1, 1)),
+        purposes=Purpose.each("step", "act"),
+    )
 
     def __init__(self, services: Services) -> None:
         self.services = services

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -99,6 +100,15 @@ class LanguageAgentTreeSearch:
         prediction_tokens: most tokens of a predicted observation, of a rating in words, and of a reflection.
         thought_tokens: most tokens of a proposal (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
+        calls=CallProfile(step=(1, 1121)),
+        rl=CallProfile(step=(1, 20)),
+        purposes=Purpose.each("step", "propose", "value", "reflect", "world"),
+        needs=("n", "snapshots"),
+        waived={"snapshots": ("world", "model")},
+    )
 
     def __init__(
         self,

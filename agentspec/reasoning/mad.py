@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, assistant, user
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -72,6 +73,13 @@ class MultiAgentDebate(Stateless):
         quote_tokens: most tokens quoted of one other answer.
         thought_tokens: most tokens of an answer in words (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "agents answer, read each other's answers, answer again, and vote",
+        calls=CallProfile(step=(9, 18)),
+        rl=CallProfile(step=(4, 4)),
+        purposes=Purpose.each("step", "argue", "act"),
+    )
 
     def __init__(
         self,

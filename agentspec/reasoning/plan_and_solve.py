@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -71,6 +72,13 @@ class PlanAndSolve:
         feedback_tokens: budget of the failures that the planner is shown.
         thought_tokens: most tokens of a step's words (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "a plan of sub-goals that persists, then one sub-goal at a time; plans anew when it fails or is done",
+        calls=CallProfile(step=(1, 3)),
+        rl=CallProfile(step=(1, 2)),
+        purposes=Purpose.each("step", "plan", "think", "act"),
+    )
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -139,6 +140,19 @@ class ReasoningViaPlanning(Stateless):
         prediction_tokens: most tokens of a predicted observation.
         thought_tokens: most tokens of a proposed action (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "Monte-Carlo tree search with the model as world model and judge",
+        calls=CallProfile(step=(1, 91)),
+        rl=CallProfile(step=(1, 16)),
+        purposes=Purpose.each("step", "propose", "world", "judge"),
+        needs=("n", "score"),
+        waived={"score": ("evaluation", "samples")},
+        small=(
+            {"preset": "rl", "evaluation": "samples", "output": "max_visits"},
+            {"preset": "rl", "output": "max_iter"},
+        ),
+    )
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 
 from agentspec.actions import parse_action
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.protocols import Services
 from agentspec.reasoning.common import ask_action, default_answer, last_action_line, sampled, static_prompt, user_turn
 from agentspec.state import dump_state, load_state
@@ -38,6 +39,12 @@ class ReAct:
         thought_tokens: most tokens of a thought (``None``: the spec's ``max_tokens``).
         history: steps of transcript shown in the ``snapshot`` layout.
     """
+
+    declaration = Declaration(
+        "a growing transcript of thought, action and observation",
+        calls=CallProfile(step=(1, 11)),
+        purposes=Purpose.each("step", "think", "act"),
+    )
 
     def __init__(
         self,

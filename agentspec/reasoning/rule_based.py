@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from agentspec.actions import parse_action
+from agentspec.declaration import Declaration
 from agentspec.envs.experts import NoPlayer, Player, player
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
@@ -37,6 +38,12 @@ class RuleBased(Stateless):
     Args:
         parameters: of the expert, as its environment documents them; for DeliveryBench `bagging` and `hasty`.
     """
+
+    declaration = Declaration(
+        "the environment's scripted expert: no model, a baseline and demonstrator",
+        envs=("deliverybench",),
+        aliases=("simple",),
+    )
 
     def __init__(self, services: Services, parameters: Mapping[str, Any] | None = None) -> None:
         self.services = services
@@ -74,6 +81,12 @@ class RuleBased(Stateless):
 
 class RandomLegal(Stateless):
     """A random one of the actions that make sense now: of the menu where there is one, else the environment's own."""
+
+    declaration = Declaration(
+        "a random sensible action: no model, the floor",
+        envs=("deliverybench",),
+        name="random",
+    )
 
     def __init__(self, services: Services) -> None:
         self.services = services

@@ -11,6 +11,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, assistant, user
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -84,6 +85,14 @@ class SelfConsistency(Stateless):
             ``majority``; the others are credited as explored.
         thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "independent chains of thought, and a vote over their actions",
+        calls=CallProfile(step=(1, 6)),
+        rl=CallProfile(step=(1, 4)),
+        purposes=Purpose.each("step", "think", "act"),
+        needs=("n",),
+    )
 
     def __init__(
         self,

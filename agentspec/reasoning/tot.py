@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
 from agentspec.protocols import Services
 from agentspec.reasoning.common import (
@@ -105,6 +106,18 @@ class TreeOfThoughts(Stateless):
         course_tokens: budgets of prompt sections.
         thought_tokens: most tokens of a proposal or a judgement (``None``: the spec's ``max_tokens``).
     """
+
+    declaration = Declaration(
+        "a tree of short action sequences: propose, judge, prune, breadth or depth first",
+        calls=CallProfile(step=(1, 20)),
+        rl=CallProfile(step=(1, 8)),
+        purposes=Purpose.each("step", "propose", "value", "vote"),
+        small=(
+            {"preset": "rl", "search_strategy": "DFS"},
+            {"preset": "rl", "evaluation_strategy": "vote", "selection": "sample"},
+        ),
+        needs=("n",),
+    )
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ Lessons outlive the episode under ``scope: run``. They belong to one task and se
 
 from __future__ import annotations
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.protocols import Services
 from agentspec.reasoning.common import at_least, one_of
 from agentspec.reflection.trials import KEYS, TrialLog, episode_return, failed, key_of, trial_prompt
@@ -34,6 +35,12 @@ class Reflexion:
         reflection_tokens: most tokens of a lesson.
         trial_tokens: budget of the trial's steps in the reflector's prompt.
     """
+
+    declaration = Declaration(
+        "after a failed trial a lesson in words, shown in the next trials of the same task",
+        calls=CallProfile(episode=(0, 1)),
+        purposes={"reflect": Purpose("episode")},
+    )
 
     name = "reflexion"
 

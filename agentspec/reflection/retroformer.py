@@ -23,6 +23,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.protocols import Services
@@ -82,6 +83,14 @@ class Retroformer(Reflexion):
         when: whether a lesson is written at the ``end`` of the failed trial or at the ``start`` of the next one.
         temperature: sampling temperature of lessons (``None``: the agent's).
     """
+
+    declaration = Declaration(
+        "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
+        calls=CallProfile(episode=(0, 1)),
+        purposes={"reflect": Purpose("episode")},
+        small=({"when": "start"},),
+        small_calls=CallProfile(retrieve=(0, 1)),
+    )
 
     name = "retroformer"
 

@@ -16,6 +16,7 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.protocols import Services
@@ -75,6 +76,13 @@ class SelfRefine:
         feedback_tokens: most tokens of a feedback.
         history_tokens: budget of attempts and feedback in a prompt; the oldest go first.
     """
+
+    declaration = Declaration(
+        "a critic's feedback on the action before it is executed, and another attempt, until it is content",
+        calls=CallProfile(step=(1, 6)),
+        rl=CallProfile(step=(1, 2)),
+        purposes=Purpose.each("step", "feedback", "refine"),
+    )
 
     def __init__(
         self,

@@ -1,20 +1,20 @@
 """What the contract tests share: every registered module, models good and bad, and an episode that counts calls.
 
-A module is found by being registered; nothing here names one. Modules that are written for particular environments
-(``Entry.envs``) are not played in the test world.
+A module is found by its declaration; nothing here names one. Each is played under its presets, and under the small
+parameters it declares, with which everything it does fires within a dozen steps. Modules that are written for
+particular environments are not played in the test world.
 """
 
 from __future__ import annotations
 
 import asyncio
-import hashlib
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from agentspec.agent import Agent
+from agentspec.embedding import HashEmbedder
 from agentspec.episode import make_env
 from agentspec.llm.base import Request
 from agentspec.llm.recorder import Recorder
@@ -27,6 +27,8 @@ from agentspec.types import Decision, Recall, Task, Transition
 from tests.reasoning.numbers_env import NUMBERS
 
 KINDS = ("memory", "reasoning", "reflection")
+Script = Callable[[Request], Any]
+
 OCCASION = {
     "retrieve": "retrieve",
     "lessons": "retrieve",
@@ -38,52 +40,103 @@ OCCASION = {
 }
 
 
+LENGTH = 12
+"""Steps of an episode in which every cadence fires."""
+
+
 @dataclass(frozen=True)
 class Case:
-    """One module under one preset."""
+    """One module with one set of parameters: a preset, or one of the small sets that it declares."""
 
     kind: str
     name: str
-    preset: str
+    label: str
+    params: Mapping[str, Any]
+    profile: CallProfile
     entry: Entry
 
     @property
-    def profile(self) -> CallProfile:
-        return self.entry.presets[self.preset] if self.preset else self.entry.calls
+    def path(self) -> str:
+        """The module's name in call tags."""
+        return f"{self.kind}.{self.name}"
+
+    @property
+    def affordable(self) -> bool:
+        """Whether a dozen steps cost few calls."""
+        return self.label != "paper"
 
     def spec(self, layout: str = "conversation", **more: Any) -> AgentSpec:
         """An agent around the module; nothing else of it calls the model more than once."""
-        params = {"preset": self.preset} if self.preset else {}
-        return AgentSpec.from_data(
-            {"reasoning": "direct", self.kind: {"name": self.name, **params}, "layout": layout, **more}
-        )
+        module = {"name": self.name, **self.params}
+        return AgentSpec.from_data({"reasoning": "direct", self.kind: module, "layout": layout, **more})
 
     def __str__(self) -> str:
-        return f"{self.kind}-{self.name}" + (f"-{self.preset}" if self.preset else "")
+        return f"{self.kind}-{self.name}" + (f"-{self.label}" if self.label else "")
 
 
-def cases() -> list[Case]:
-    """Every registered module that is not tied to an environment, under each of its presets."""
-    return [
-        Case(kind, name, preset, entry)
-        for kind in KINDS
-        for name, entry in sorted(REGISTRY.entries[kind].items())
-        if not entry.envs
-        for preset in entry.presets or [""]
-    ]
+def cases(kinds: tuple[str, ...] = KINDS) -> list[Case]:
+    """Every module of this package that is not tied to an environment, with each set of parameters."""
+    found = []
+    for kind in kinds:
+        for name, entry in REGISTRY.all(kind).items():
+            if not entry.envs and entry.target.startswith("agentspec."):
+                found += variants(kind, name, entry)
+    return found
 
 
-class HashEmbedder:
-    """Unit vectors from words by hashing: equal texts are equal, shared words are near."""
+def variants(kind: str, name: str, entry: Entry) -> list[Case]:
+    """A module with each of its presets (or its defaults), and with each small set of parameters."""
+    declared = entry.declaration
+    found = [Case(kind, name, p, {"preset": p}, profile, entry) for p, profile in entry.presets.items()]
+    found = found or [Case(kind, name, "", {}, entry.calls, entry)]
+    profile = declared.small_calls or entry.calls
+    return found + [Case(kind, name, f"small{i}", p, profile, entry) for i, p in enumerate(declared.small)]
 
-    dim = 64
 
-    def embed(self, texts: list[str]) -> Any:
-        rows = np.zeros((len(texts), self.dim), dtype=np.float32)
-        for row, text in zip(rows, texts, strict=True):
-            for word in text.casefold().split() or [""]:
-                row[hashlib.sha256(word.encode()).digest()[0] % self.dim] += 1.0
-        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+def affordable(kinds: tuple[str, ...] = KINDS) -> list[Case]:
+    """The cases of which a whole episode can be played."""
+    return [case for case in cases(kinds) if case.affordable]
+
+
+def example(case: Case) -> Script:
+    """The answers that the module declares as well-formed; `lively` ones where any text will do."""
+
+    def script(request: Request) -> Any:
+        text = _example(case, request)
+        return [text] * request.sampling.n if text and not request.sampling.choices else lively(request)
+
+    return script
+
+
+def wrongly_typed(case: Case) -> Script:
+    """JSON of the declared examples with every value of another type, in turn with JSON that is none of them."""
+
+    def script(request: Request) -> Any:
+        if request.sampling.choices:
+            return lively(request)
+        text = _example(case, request)
+        try:
+            data = json.loads(text)
+        except ValueError:
+            return '{"unexpected": [1, {"text": null}]}'
+        turns = (_mistyped(data), [data], {"answer": data}, None, 7, [], {})
+        return json.dumps(turns[request.id % len(turns)])
+
+    return script
+
+
+def _example(case: Case, request: Request) -> str:
+    purpose = case.entry.purposes.get(request.tag.purpose) if request.tag.module == case.path else None
+    return purpose.example if purpose else ""
+
+
+def _mistyped(data: Any) -> Any:
+    """Every leaf as a value of another type."""
+    if isinstance(data, dict):
+        return {key: _mistyped(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_mistyped(value) for value in data] or "empty"
+    return 3.5 if isinstance(data, str) else {"value": str(data)}
 
 
 def lively(request: Request) -> Any:
@@ -125,6 +178,20 @@ MALFORMED = {
     "half-json": constant('{"action": "ADD(", "notes": [1, 2'),
     "10kB": constant("Action: ADD(((((" + "[1, " * 2500),
 }
+
+
+def scripts(case: Case) -> dict[str, Script]:
+    """Models good and bad."""
+    return {
+        "lively": lively,
+        "restless": restless,
+        "example": example(case),
+        "wrongly-typed": wrongly_typed(case),
+        **MALFORMED,
+    }
+
+
+SCRIPTS = ("lively", "restless", "example", "wrongly-typed", *MALFORMED)
 
 
 class Inline:
@@ -172,7 +239,7 @@ class Played:
         return getattr(self.agent, case.kind)._module
 
 
-def start(case: Case, script: Any, *, layout: str = "conversation", menu: bool = False, **more: Any) -> Played:
+def start(case: Case, script: Any, *, layout: str = "conversation", **more: Any) -> Played:
     """An agent around the module, its environment reset, its episode begun; see :func:`steps`."""
     requests: list[Request] = []
 
@@ -180,7 +247,7 @@ def start(case: Case, script: Any, *, layout: str = "conversation", menu: bool =
         requests.append(request)
         return script(request)
 
-    spec = case.spec(layout, **more)
+    spec = case.spec(layout, **{"scope": "run", **more})
     recorder = Recorder(ScriptedLLM(spy), episode="contract", seed=3, sampling=spec.sampling, budget=spec.budget)
     agent = spec.build(recorder, embedder=HashEmbedder())
     played = Played(agent, recorder, requests)
@@ -188,9 +255,19 @@ def start(case: Case, script: Any, *, layout: str = "conversation", menu: bool =
     return played
 
 
-def play(case: Case, script: Any, *, menu: bool = False, layout: str = "conversation", length: int = 3) -> Played:
-    """A whole episode of a puzzle that cannot be solved."""
+def play(
+    case: Case,
+    script: Any,
+    *,
+    menu: bool = False,
+    layout: str = "conversation",
+    length: int = 3,
+    carried: bytes | None = None,
+) -> Played:
+    """A whole episode of a puzzle that cannot be solved, from an empty memory or from what an earlier one carried."""
     played = start(case, script, layout=layout)
+    if carried is not None:
+        played.agent.resume(carried)
     task = Task(NUMBERS, 0, {"menu": menu, "steps": length, "target": 1000})
     for _ in steps(played, task):
         pass
@@ -199,12 +276,19 @@ def play(case: Case, script: Any, *, menu: bool = False, layout: str = "conversa
     return played
 
 
-def steps(played: Played, task: Task) -> Iterator[Transition]:
-    """Play ``task`` step by step."""
+def begin(played: Played, task: Task) -> tuple[Any, Any, dict[str, Any]]:
+    """Reset the environment of ``task`` and begin the agent's episode in it."""
     env, agent = make_env(task), played.agent
     observation, info = env.reset(seed=task.seed)
     agent.attach_simulator(simulator_of(env, Inline(), task, agent.perception))
     agent.begin_episode(task)
+    return env, observation, info
+
+
+def steps(played: Played, task: Task) -> Iterator[Transition]:
+    """Play ``task`` step by step."""
+    agent = played.agent
+    env, observation, info = begin(played, task)
     while True:
         seen, decision = asyncio.run(agent.decide(task, observation, info))
         played.decisions.append(decision)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -183,6 +184,12 @@ def test_time_out_is_retried_then_named(server):
     server.delay = lambda i: 3.0
     with pytest.raises(LLMError, match=r"no answer within 1"):
         ask(llm(server, timeout_s=1.0, max_retries=0))
+
+
+def test_a_missing_library_is_told_before_anything_is_asked(monkeypatch):
+    monkeypatch.setitem(sys.modules, "httpx", None)  # importing it raises ImportError
+    with pytest.raises(LLMError, match=r"needs httpx; run `pip install 'agentspec-rl\[openai\]'`"):
+        OpenAILLM("m", base_url="http://127.0.0.1:9/v1")
 
 
 def test_no_server():

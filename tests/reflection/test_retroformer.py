@@ -16,6 +16,8 @@ from trainers.estimators import grpo
 from trainers.sequences import TrainFilter, build_sequences
 
 RETRO = {**SPEC, "reflection": "retroformer"}
+AT_START = {**SPEC, "reflection": {"name": "retroformer", "when": "start"}}
+"""How lessons are trained: the trial that a lesson is for begins with it, and pays for it."""
 
 
 def chain(script, trials: int, spec: dict | None = None) -> list[Trajectory]:
@@ -66,14 +68,16 @@ def test_samples_join_prompt_and_reward_across_trials(tmp_path) -> None:
 
 
 def test_the_reflector_is_trained_and_the_actor_is_not() -> None:
-    first = chain(learner, 1)[0]
-    (row,) = build_sequences(first, TrainFilter((PATH,)))
-    lesson = first.calls[-1]
+    second = chain(learner, 2, AT_START)[1]
+    (row,) = build_sequences(second, TrainFilter((PATH,)))
+    lesson = second.calls[0]
     trained = [t for t, m in zip(row.tokens, row.mask, strict=True) if m]
     assert trained == list(lesson.completions[0].token_ids) and set(row.calls) == {-1, lesson.id}
     # And the other way round: training the actor leaves the reflector alone.
-    actor = build_sequences(first, TrainFilter(("reasoning.*",)))
+    actor = build_sequences(second, TrainFilter(("reasoning.*",)))
     assert actor and all(lesson.id not in row.calls for row in actor)
+    # A lesson that is written when its episode is over earns nothing there.
+    assert build_sequences(chain(learner, 1)[0], TrainFilter((PATH,))) == []
 
 
 def test_gradients_reach_the_reflectors_adapter_only() -> None:
@@ -86,7 +90,7 @@ def test_gradients_reach_the_reflectors_adapter_only() -> None:
     )
     model.add_adapter("reflector", peft.LoraConfig(r=2, target_modules=["q_proj"]))
     model.set_adapter("reflector")
-    (row,) = build_sequences(chain(learner, 1)[0], TrainFilter((PATH,)))
+    (row,) = build_sequences(chain(learner, 2, AT_START)[1], TrainFilter((PATH,)))
     ids, mask = torch.tensor([row.tokens]) % model.config.vocab_size, torch.tensor([row.mask])
     logprobs = model(ids).logits[:, :-1].log_softmax(-1).gather(-1, ids[:, 1:, None])[..., 0]
     advantage = 1.0

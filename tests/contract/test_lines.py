@@ -1,0 +1,65 @@
+"""How much of each method the contract reaches: the lines of its file that run while it is played in every way."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+from pathlib import Path
+
+import pytest
+
+from tests.contract.harness import LENGTH, SCRIPTS, affordable, cases, example, play, scripts
+from tests.contract.lines import function_lines, traced
+
+LEAST = 0.85
+"""Share of a method's lines that must run; the rest is for parameters that the played variants do not set."""
+
+
+def test_lines_are_counted_exactly(tmp_path: Path) -> None:
+    source = '"""Doc."""\n\nX = 1\n\n\ndef _f(a):\n    """Doc."""\n    if a:\n        return 1\n    return 2\n'
+    source += "\n\ndef public():\n    return 3\n"
+    path = tmp_path / "counted.py"
+    path.write_text(source, encoding="utf-8")
+    scope: dict = {}
+    code = compile(source, str(path), "exec")
+    assert function_lines(path) == {8, 9, 10}
+    with traced(path) as seen:
+        import types
+
+        module = types.FunctionType(code, scope)
+        module()
+        scope["_f"](1)
+    assert function_lines(path) & seen == {8, 9}
+
+
+@pytest.mark.parametrize("module", sorted({c.path for c in cases()}))
+def test_the_contract_reaches_the_method(module: str) -> None:
+    mine = [c for c in affordable() if c.path == module]
+    path = Path(inspect.getsourcefile(mine[0].entry.load()) or "")
+    with traced(path) as seen:
+        for case, menu in itertools.product(mine, (False, True)):
+            for i, model in enumerate(SCRIPTS):
+                layout = ("conversation", "snapshot")[(i + menu) % 2]
+                played = play(case, scripts(case)[model], menu=menu, layout=layout, length=LENGTH)
+                tested = played.module(case)
+                tested.restore(tested.snapshot())
+                if model == "example":
+                    carried = played.agent.carry()
+                    played = play(case, example(case), menu=menu, layout=layout, length=LENGTH, carried=carried)
+                    played.agent.metrics()
+    lines = function_lines(path)
+    missed = sorted(lines - seen)
+    share = 1 - len(missed) / max(1, len(lines))
+    print(f"{module}: {share:.0%} of {len(lines)} lines; missed {_ranges(missed) or 'none'}")
+    assert share >= LEAST, f"{path.name}: {share:.0%} of its lines run, not {_ranges(missed)}; declare `small` sets"
+
+
+def _ranges(lines: list[int]) -> str:
+    """Line numbers as ranges: `3-5, 9`."""
+    parts: list[list[int]] = []
+    for line in lines:
+        if parts and line == parts[-1][1] + 1:
+            parts[-1][1] = line
+        else:
+            parts.append([line, line])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in parts)
