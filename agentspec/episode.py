@@ -22,6 +22,7 @@ from agentspec.agent import Agent
 from agentspec.envs import environment_id, make_env
 from agentspec.llm.base import LLM, ContextOverflowError, LLMError
 from agentspec.llm.helpers import helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.pricing import Prices
 from agentspec.llm.recorder import Recorder, derive_seed
 from agentspec.protocols import Embedder
@@ -147,7 +148,7 @@ class Runner:
         """As :meth:`run`, inside a running loop."""
         llm: LLM = self.llm or NoLLM()
         self.spec.check(self._offered(llm) | {"snapshots"}, f"backend {llm.name!r}")
-        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items()}
+        helpers = {pattern: helper(config) for pattern, config in self.spec.roles.items() if self.spec.helped(pattern)}
         progress = self.progress(len(jobs)) if self.progress else None
         gate = asyncio.Semaphore(self.concurrency or max(1, len(jobs)))
 
@@ -322,29 +323,6 @@ def _scaffold_metrics(transitions: Sequence[Transition], recorder: Recorder, end
         "problems": sum(recorder.problems.values()),
         "ended": ended,
     }
-
-
-class NoLLM:
-    """The backend of agents without a model: any call is an error that says so."""
-
-    name = "none"
-    capabilities: frozenset[str] = frozenset()
-    max_context = 0
-
-    async def generate(self, request: Any) -> Any:
-        raise LLMError(f"{request.tag.path} asked for a model, but none was configured; name one with `--model`")
-
-    async def score(self, messages: Any, continuations: Any, *, episode: str = "") -> Any:
-        raise LLMError("a module asked for scores, but no model was configured; name one with `--model`")
-
-    def count_tokens(self, text: str) -> int:
-        return len(text) // 4 + 1
-
-    def enter(self, episode: str) -> None:
-        return None
-
-    def leave(self, episode: str) -> None:
-        return None
 
 
 __all__ = ["EnvWorker", "EnvironmentFailedError", "Job", "NoLLM", "Runner", "environment_id", "make_env"]

@@ -16,7 +16,6 @@ reasoner `decide`) and by `declaration`.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import inspect
 import pkgutil
 import re
@@ -24,12 +23,12 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
 from agentspec.actions import suggest
 from agentspec.declaration import CallProfile, Declaration, Purpose
+from agentspec.importing import SpecError, import_module
 
 __all__ = ["REGISTRY", "CallProfile", "Declaration", "Entry", "Purpose", "Registry", "SpecError", "import_modules"]
 
@@ -44,10 +43,6 @@ METHODS: Mapping[Kind, tuple[str, ...]] = {
 """Which methods make a class a module of a kind."""
 
 MODULES_GROUP, ENVS_GROUP = "agentspec.modules", "agentspec.envs"
-
-
-class SpecError(ValueError):
-    """A spec, name or configuration that cannot work: what was given, what was expected, what to do."""
 
 
 @dataclass(frozen=True)
@@ -262,43 +257,7 @@ def import_modules(names: Sequence[str]) -> None:
         SpecError: a module that is not there, or that fails when it is imported.
     """
     for name in names:
-        REGISTRY.add_module(_import(name))
-
-
-def _import(name: str) -> ModuleType:
-    path = Path(name)
-    if path.suffix == ".py" or "/" in name:
-        return _import_file(path)
-    if str(Path.cwd()) not in sys.path and "" not in sys.path:
-        sys.path.append(str(Path.cwd()))  # at the end: what lies there replaces nothing that is installed
-    try:
-        return importlib.import_module(name)
-    except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name)):
-            raise SpecError(
-                f"no module {name!r} to import; give a module that Python finds from here, or the path of a .py file"
-            ) from error
-        raise SpecError(f"importing {name!r} failed: {type(error).__name__}: {error}") from error
-
-
-def _import_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise SpecError(f"no file {path} to import; give the path of a Python file, or a module's name")
-    loaded = sys.modules.get(path.stem)
-    if loaded is not None and getattr(loaded, "__file__", None) == str(path.resolve()):
-        return loaded
-    found = importlib.util.find_spec(path.stem)
-    if loaded is not None or (found is not None and found.origin != str(path.resolve())):
-        raise SpecError(f"{path} would hide the module {path.stem!r} that exists already; rename the file")
-    location = importlib.util.spec_from_file_location(path.stem, path.resolve())
-    assert location is not None and location.loader is not None
-    module = sys.modules[path.stem] = importlib.util.module_from_spec(location)
-    try:
-        location.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[path.stem]
-        raise SpecError(f"importing {path} failed: {type(error).__name__}: {error}") from error
-    return module
+        REGISTRY.add_module(import_module(name))
 
 
 def kind_of(cls: Any) -> Kind:
@@ -330,7 +289,7 @@ def _declared(module: ModuleType) -> Iterator[Any]:
 def _from_path(kind: str, name: str) -> Entry:
     """The entry of `package.module:Class`."""
     module, _, attribute = name.partition(":")
-    cls = getattr(_import(module), attribute, None)
+    cls = getattr(import_module(module), attribute, None)
     if not inspect.isclass(cls):
         classes = [v for v in vars(sys.modules[module]).values() if inspect.isclass(v)]
         names = [c.__name__ for c in classes if c.__module__ == module]

@@ -138,8 +138,8 @@ class Services:
             purpose: what for, one of the purposes that the module declares.
             messages: the prompt; a text stands for one user turn.
             max_tokens: room for the answer.
-            parse: reads the answer (`json_of(...)`, or a function that raises `ValueError`); without it the value is
-                the text without reasoning blocks, `None` if nothing is left.
+            parse: reads the answer (`json_of(...)`, or a function that raises where it cannot); without it the value
+                is the text without reasoning blocks, `None` if nothing is left.
             credit: what the call counts as for training, whether or not it can be read.
             sampling: other sampling fields, `temperature` for one.
 
@@ -184,7 +184,7 @@ class Services:
             return Answer(text or None, call, "truncated" if cut else "" if text else "malformed")
         try:
             return Answer(parse(call.text), call)
-        except ValueError:
+        except Exception:  # whatever a reader raises at a text it cannot read, the text is to blame
             return Answer(None, call, "truncated" if cut else "malformed")
 
     @staticmethod
@@ -193,6 +193,6 @@ class Services:
             parse(text)
         except ParseError as error:
             return str(error)
-        except ValueError:
+        except Exception:
             pass
         return "it is not what was asked for"

@@ -29,11 +29,11 @@ import yaml
 from agentspec.actions import suggest
 from agentspec.context import Context, Layout, Placement
 from agentspec.llm.helpers import check_helper
+from agentspec.llm.none import NoLLM
 from agentspec.llm.recorder import Budget, ModuleLLM, Recorder, derive_seed
 from agentspec.parameters import check_parameters, check_types
 from agentspec.protocols import Embedder, Services, StepClock
 from agentspec.registry import REGISTRY, SpecError, import_modules, snake_case
-from agentspec.tokens import estimate_tokens
 from agentspec.types import Sampling
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class AgentSpec:
             from agentspec.embedding import check_embedder
 
             check_embedder(self.embedder)
-        self._build(Recorder(_NoBackend(), episode="", seed=0), None)
+        self._build(Recorder(NoLLM(), episode="", seed=0), None)
 
     @classmethod
     def from_yaml(cls, source: str | Path) -> AgentSpec:
@@ -193,6 +193,16 @@ class AgentSpec:
     def _needs_of(self, kind: str) -> tuple[str, ...]:
         module: ModuleSpec = getattr(self, kind)
         return REGISTRY.get(kind, module.name).needs_with(module.params)
+
+    def call_paths(self) -> list[str]:
+        """`module/purpose` paths of the calls that the modules may make, as patterns over calls match them."""
+        paths = []
+        for kind in MODULE_KINDS:
+            module: ModuleSpec = getattr(self, kind)
+            entry = REGISTRY.get(kind, module.name)
+            if entry.calls.calls_model:
+                paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
+        return paths
 
     def check(self, capabilities: frozenset[str], who: str) -> None:
         """Refuse a backend that lacks what a module needs.
@@ -266,28 +276,24 @@ class AgentSpec:
                 raise SpecError(f"{kind} {spec.name!r}: {error}") from error
         return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
 
+    def helped(self, pattern: str) -> list[str]:
+        """The modules that a pattern of `roles` names."""
+        return [module for module in self._modules() if fnmatchcase(module, pattern)]
+
+    def _modules(self) -> list[str]:
+        return [f"{kind}.{getattr(self, kind).short}" for kind in MODULE_KINDS[1:]]
+
     def _check_roles(self) -> None:
         """Refuse roles of no module, and backends that say neither what nor where."""
-        modules = [f"{kind}.{getattr(self, kind).short}" for kind in MODULE_KINDS]
         for pattern, backend in self.roles.items():
-            if not any(fnmatchcase(module, pattern) for module in modules):
-                raise SpecError(f"roles: {pattern!r} matches none of the modules {', '.join(modules)}")
+            if not self.helped(pattern):
+                modules = ", ".join(self._modules())
+                raise SpecError(f"roles: {pattern!r} matches none of the modules {modules}")
             check_helper(f"roles: {pattern!r}", backend)
 
 
 _FIELDS = [f.name for f in dataclasses.fields(AgentSpec)]
 _PLAIN = ("layout", "max_turns", "scope", "recall", "recall_tokens", "lesson_tokens", "embedder", "roles")
-
-
-class _NoBackend:
-    """Stands in for a model while a spec is validated: modules are built, and nothing is asked."""
-
-    name = "none"
-    capabilities: frozenset[str] = frozenset()
-    max_context = 0
-
-    def count_tokens(self, text: str) -> int:
-        return estimate_tokens(text)
 
 
 def _dataclass(cls: Any, value: Any, where: str) -> Any:

@@ -21,8 +21,12 @@ from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, 
 T = TypeVar("T")
 
 _THINKING = re.compile(r"<(think|thinking|reasoning)>.*?(?:</\1>|\Z)", re.DOTALL | re.IGNORECASE)
+_THINKING_ENDS = re.compile(r"\A.*</(think|thinking|reasoning)>", re.DOTALL | re.IGNORECASE)
 _STARTS = re.compile(r"[\[{]")
 _MOST_STARTS = 64  # values tried in one text; a longer search only serves texts that are no answer
+HUGE = 1e300
+"""Numbers from here on are no answer to any question."""
+
 _NAMES = {str: "string", int: "whole number", float: "number", bool: "true or false", dict: "object", list: "list"}
 
 
@@ -61,25 +65,35 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
 
     def read(text: str) -> Any:
         problem = "there is no JSON in it"
-        for value in _values(without_thinking(text)):
+        for raw in _values(without_thinking(text)):
             try:
-                return check(value, schema)
+                return check(_replace_surrogates(raw) if "\\u" in text else raw, schema)
             except ParseError as error:
                 if problem.startswith("there is no JSON"):
                     problem = str(error)
+            except RecursionError:
+                problem = "it is nested too deeply"
         raise ParseError(problem)
 
     return Parser(read, f"JSON of the form {describe(schema)}", repairs)
 
 
 def without_thinking(text: str) -> str:
-    """The text without its reasoning blocks, closed or cut off."""
-    return _THINKING.sub("", text).strip()
+    """The text without its reasoning blocks: closed, cut off, or opened by the prompt.
+
+    >>> without_thinking("hm</think>Yes. <think>or")
+    'Yes.'
+    """
+    return _THINKING_ENDS.sub("", _THINKING.sub("", text)).strip()
 
 
 def _values(text: str) -> Iterator[Any]:
-    """The JSON objects and lists of a text, outermost first; what lies inside a value is no value of its own."""
-    decoder = json.JSONDecoder()
+    """The JSON objects and lists of a text, outermost first; what lies inside a value is no value of its own.
+
+    Strings may hold line breaks, which models write; halves of surrogate pairs, which no file or prompt can hold, are
+    replaced.
+    """
+    decoder = json.JSONDecoder(strict=False)
     end = 0
     for number, match in enumerate(_STARTS.finditer(text)):
         if number >= _MOST_STARTS:
@@ -93,7 +107,17 @@ def _values(text: str) -> Iterator[Any]:
         yield value
 
 
-def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: PLR0911  # one line per type
+def _replace_surrogates(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode()
+    if isinstance(value, list):
+        return [_replace_surrogates(v) for v in value]
+    if isinstance(value, dict):
+        return {_replace_surrogates(k): _replace_surrogates(v) for k, v in value.items()}
+    return value
+
+
+def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: PLR0911, PLR0912  # one line per type
     """The JSON value as the schema has it.
 
     Raises:
@@ -105,7 +129,11 @@ def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: P
         hints = get_type_hints(schema)
         defaults = {f.name: f for f in dataclasses.fields(schema) if _has_default(f)}
         fields = {f.name: hints[f.name] for f in dataclasses.fields(schema) if f.init}
-        return schema(**_check_fields(value, fields, defaults, where))
+        given = _check_fields(value, fields, defaults, where)
+        try:
+            return schema(**given)
+        except (TypeError, ValueError) as error:  # the class's own checks
+            raise ParseError(f"{where}: {error}") from error
     origin, arguments = get_origin(schema), get_args(schema)
     if schema is Any:
         return value
@@ -120,11 +148,15 @@ def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: P
     elif origin in (dict, Mapping) and isinstance(value, dict):
         return {k: check(v, arguments[1], f"{k!r} of {where}") for k, v in value.items()}
     elif schema is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        if abs(value) < HUGE:  # not so for NaN, infinity, and whole numbers that no float holds
+            return float(value)
     elif schema in (None, type(None)):
         if value is None:
             return None
-    elif isinstance(schema, type) and isinstance(value, schema) and not (schema is int and isinstance(value, bool)):
+    elif schema is int:
+        if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63:  # what tables and arrays hold
+            return value
+    elif isinstance(schema, type) and isinstance(value, schema):
         return value
     raise ParseError(f"{where} must be {describe(schema)}, not {_shown(value)}")
 

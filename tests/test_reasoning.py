@@ -29,7 +29,7 @@ def test_direct_sees_actions_and_memory() -> None:
     assert "SELL()" in seen[0].messages[0].text and "WAIT()" in seen[0].messages[0].text
     last = seen[-1].messages[-1].text
     # Window 2: of the four earlier steps the last two, oldest first.
-    assert "2. WAIT()" not in last and last.index("3. WAIT()") < last.index("4. WAIT()") < last.index("The price is")
+    assert "2. WAIT()" not in last and last.index("3. WAIT()") < last.index("4. WAIT()") < last.rindex("The price is")
     assert all(d.decision.rationale == "" for d in trajectory.transitions)
     assert {r.messages[0].text for r in seen} == {seen[0].messages[0].text}  # static text first, the same every step
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from agentspec.context import Context
 from agentspec.llm.base import Request
 from agentspec.llm.recorder import Budget, ModuleLLM, Recorder
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.services import Answer, Services, StepClock, Time
+from agentspec.state import dump_state, load_state
 from agentspec.structured import ParseError, describe, json_of
 from agentspec.types import Sampling
 
@@ -23,6 +27,15 @@ class Note:
     text: str
     weight: float
     tags: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Share:
+    part: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.part <= 1:
+            raise ValueError(f"part must lie between 0 and 1, not {self.part}")
 
 
 NOTE = json_of(Note)
@@ -49,6 +62,7 @@ def problems(given: Services) -> dict[str, int]:
         '{"text": "hot food", "weight": 2}',
         'Here it is:\n```json\n{"text": "hot food", "weight": 2.0, "tags": []}\n```\nGood luck!',
         '<think>{"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2, "more": 1}',
+        'a prompt may open it: {"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2}',
         'As in {the rules}, [see above]: {"text": "hot food", "weight": 2} and so on {"text": "b", "weight": 1}',
     ],
 )
@@ -59,6 +73,7 @@ def test_json_is_found_in_what_is_written_around_it(text: str) -> None:
 @pytest.mark.parametrize(
     ("schema", "text", "problem"),
     [
+        (Share, '{"part": 2}', "part must lie between 0 and 1"),
         (Note, "Nothing to say.", "there is no JSON in it"),
         (Note, '{"text": "a"}', "the answer lacks 'weight'"),
         (Note, '{"text": 3, "weight": 1}', "'text' must be string, not 3"),
@@ -76,6 +91,35 @@ def test_what_does_not_fit_says_why(schema: Any, text: str, problem: str) -> Non
     with pytest.raises(ParseError) as caught:
         json_of(schema)(text)
     assert problem in str(caught.value)
+
+
+@given(st.one_of(st.text(), st.text('{}[]",:\\\\u0d8 tnf19eE+-"', max_size=80)))
+@settings(deadline=None, max_examples=300)
+def test_no_text_raises_anything_but_a_parse_error(text: str) -> None:
+    for schema in (Note, list[Any], {"a": dict[str, float]}, dict[str, Any]):
+        with contextlib.suppress(ParseError):
+            load_state(dump_state(json_of(schema)(text) if schema is not Note else str(json_of(schema)(text))))
+
+
+def test_what_no_file_or_prompt_can_hold_is_replaced_or_refused() -> None:
+    # Half of a surrogate pair, a line break inside a string, numbers that are none, and depth without end.
+    assert json_of({"text": str})('{"text": "a\\ud800b\nc"}') == {"text": "a?b\nc"}
+    for number in ("NaN", "Infinity", "1e999", "1" * 400):
+        with pytest.raises(ParseError, match="'n' must be number"):
+            json_of({"n": float})(f'{{"n": {number}}}')
+    with pytest.raises(ParseError, match="'n' must be whole number"):
+        json_of({"n": int})(f'{{"n": {2**63}}}')
+    for text in ("[" * 900 + "]" * 900, '{"a":' * 100_000, "[" * 900 + '"\\ud800"' + "]" * 900):
+        with pytest.raises(ParseError):
+            json_of({"a": int})(text)
+
+
+def test_whatever_a_reader_raises_the_text_is_to_blame() -> None:
+    import json
+
+    given = services('{"steps": 3}')
+    answer = ask(given, lambda text: [s.strip() for s in json.loads(text)["steps"]])  # a TypeError: no list
+    assert answer.value is None and answer.problem == "malformed" and problems(given) == {"malformed": 1}
 
 
 def test_types_are_read_as_the_schema_has_them() -> None:

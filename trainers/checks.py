@@ -16,8 +16,8 @@ from trl import GRPOConfig
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import REGISTRY, SpecError
-from agentspec.spec import MODULE_KINDS, AgentSpec
+from agentspec.registry import SpecError
+from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import field_rules
 from trainers.losses import LOSSES, loss
@@ -124,7 +124,7 @@ def _known(value: Any, known: Collection[str], what: str) -> None:
 def check_calls(config: ScaffoldConfig) -> None:
     """Something is trained, and sampled so that it can be."""
     spec = config.spec
-    paths = call_paths(spec)
+    paths = spec.call_paths()
     missing = unmatched_patterns(paths, config.train_filter)
     if missing:
         raise SpecError(
@@ -148,17 +148,6 @@ def check_calls(config: ScaffoldConfig) -> None:
             "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full "
             "distribution and would not match the sampled ones; train with top_p 1 and top_k 0"
         )
-
-
-def call_paths(spec: AgentSpec) -> list[str]:
-    """`module/...` paths of the modules that may call the model, for checking patterns before a run."""
-    paths = []
-    for kind in MODULE_KINDS:
-        module = getattr(spec, kind)
-        entry = REGISTRY.get(kind, module.name)
-        if entry.calls.calls_model:
-            paths += [f"{kind}.{module.short}/{purpose}" for purpose in entry.purposes or ("*",)]
-    return paths
 
 
 def check_lora(config: ScaffoldConfig) -> None:

@@ -7,6 +7,7 @@ from collections import deque
 from agentspec.declaration import Declaration
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
+from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -17,10 +18,12 @@ def describe(transition: Transition) -> str:
 
 
 class BaseMemory:
-    """The last ``window`` steps of the episode as text.
+    """The last `window` steps of the episode as text: action, outcome, and what was seen.
 
     Args:
         window: steps kept.
+        observation_tokens: most tokens of each step's observation; in a conversation, which holds the observations
+            themselves, none are repeated.
     """
 
     declaration = Declaration(
@@ -28,10 +31,11 @@ class BaseMemory:
         aliases=("simple",),
     )
 
-    def __init__(self, services: Services, window: int = 5) -> None:
+    def __init__(self, services: Services, window: int = 5, observation_tokens: int = 32) -> None:
         if window < 1:
             raise ValueError(f"memory base: window must be at least 1, got {window}")
         self.services = services
+        self.observation_tokens = observation_tokens
         self._lines: deque[str] = deque(maxlen=window)
 
     def begin_episode(self, task: Task) -> None:
@@ -42,7 +46,11 @@ class BaseMemory:
         return Recall(tuple(RecallItem(line, source="memory.base", priority=i) for i, line in enumerate(lines)))
 
     async def store(self, transition: Transition) -> None:
-        self._lines.append(describe(transition))
+        line = describe(transition)
+        if self.observation_tokens and self.services.context.layout == "snapshot":
+            seen = " ".join(transition.input.text.split())
+            line += f"\n   seen: {clip_text(seen, self.observation_tokens, self.services.llm.count_tokens)}"
+        self._lines.append(line)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         return None

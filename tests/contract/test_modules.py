@@ -13,7 +13,7 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.registry import REGISTRY
 from agentspec.trajectory import Trajectory
-from agentspec.types import Action, ActionError, ActionSchema, AgentInput, Decision, Recall, Task
+from agentspec.types import Action, ActionError, ActionSchema, AgentInput, Decision, Recall, RecallItem, Task
 from tests.contract.harness import (
     KINDS,
     LENGTH,
@@ -219,3 +219,30 @@ def test_needs_and_waivers_name_what_exists() -> None:
             module = ModuleSpec.parse(case.kind, {"name": case.name, parameter: value})
             assert need not in case.entry.needs_with(module.params)
         ModuleSpec.parse(case.kind, {"name": case.name, **case.params})
+
+
+class Marked:
+    """A memory that recalls one thing, always."""
+
+    def __init__(self, inner: object) -> None:
+        self.inner = inner
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.inner, name)
+
+    async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
+        return Recall((RecallItem("REMEMBER-7"),))
+
+
+@both_modes
+@both_layouts
+@pytest.mark.parametrize("case", affordable(("reasoning", "reflection")), ids=str)
+def test_every_prompt_of_a_step_shows_what_memory_recalled_once(case: Case, layout: str, menu: bool) -> None:
+    played = start(case, lively, layout=layout)
+    played.agent.memory = Marked(played.agent.memory)  # type: ignore[assignment]
+    for _ in steps(played, Task(NUMBERS, 0, {"menu": menu, "steps": 3, "target": 1000})):
+        pass
+    for request in played.requests:
+        if request.tag.path.startswith("reasoning.") or request.tag.purpose in ("feedback", "refine"):
+            text = "".join(m.text for m in request.messages)
+            assert text.count("REMEMBER-7") == 1, request.tag.path

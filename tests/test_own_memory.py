@@ -1,4 +1,4 @@
-"""The tutorials' code is run as it is printed."""
+"""The memory of the tutorial is run as it is printed."""
 
 from __future__ import annotations
 

@@ -1,0 +1,54 @@
+"""Code of the user's own: a module by its name, or a Python file by its path."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+
+class SpecError(ValueError):
+    """A spec, name or configuration that cannot work: what was given, what was expected, what to do."""
+
+
+def import_module(name: str) -> ModuleType:
+    """The module of that name, or of that Python file.
+
+    Raises:
+        SpecError: it is not there, would hide another module, or fails when it is imported.
+    """
+    path = Path(name)
+    if path.suffix == ".py" or "/" in name:
+        return _import_file(path)
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.append(str(Path.cwd()))  # at the end: what lies there replaces nothing that is installed
+    try:
+        return importlib.import_module(name)
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name)):
+            raise SpecError(
+                f"no module {name!r} to import; give a module that Python finds from here, or the path of a .py file"
+            ) from error
+        raise SpecError(f"importing {name!r} failed: {type(error).__name__}: {error}") from error
+
+
+def _import_file(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise SpecError(f"no file {path} to import; give the path of a Python file, or a module's name")
+    loaded = sys.modules.get(path.stem)
+    if loaded is not None and getattr(loaded, "__file__", None) == str(path.resolve()):
+        return loaded
+    found = importlib.util.find_spec(path.stem)
+    if loaded is not None or (found is not None and found.origin != str(path.resolve())):
+        raise SpecError(f"{path} would hide the module {path.stem!r} that exists already; rename the file")
+    location = importlib.util.spec_from_file_location(path.stem, path.resolve())
+    assert location is not None and location.loader is not None
+    module = sys.modules[path.stem] = importlib.util.module_from_spec(location)
+    try:
+        location.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[path.stem]
+        raise SpecError(f"importing {path} failed: {type(error).__name__}: {error}") from error
+    return module
