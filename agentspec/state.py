@@ -7,10 +7,11 @@ entry is oldest, which was used last), and a module must go on from a snapshot a
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from pathlib import Path
 from typing import Any
+
+from agentspec.files import write_atomic
+
+__all__ = ["dump_state", "load_state", "write_atomic"]
 
 
 def dump_state(data: Any) -> bytes:
@@ -37,21 +38,3 @@ def _require_string_keys(data: Any) -> None:
     elif isinstance(data, list | tuple):
         for value in data:
             _require_string_keys(value)
-
-
-def write_atomic(path: str | Path, data: str | bytes) -> None:
-    """Write a file so that it is either whole or absent, never half written (temporary file, then rename)."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    blob = data.encode() if isinstance(data, str) else data
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(blob)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

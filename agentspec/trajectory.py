@@ -2,7 +2,8 @@
 
 A trajectory holds everything that evaluation, rewards and training need: the task, the spec, every transition, every
 model call with its tokens and log-probabilities, the environment's metrics, seed and versions. Prompts of successive
-calls mostly extend each other, so a prompt is stored as the length of what it shares with the call before and the rest.
+calls mostly extend each other, so a prompt is stored as what it keeps of the tokens before it, and the rest.
+`docs/trajectories.md` describes every field of the format and has a reader that stands alone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from agentspec import __version__
-from agentspec.state import write_atomic
+from agentspec.files import jsonable, write_atomic
 from agentspec.tokens import shared_prefix
 from agentspec.types import (
     Action,
@@ -35,7 +36,9 @@ from agentspec.types import (
     Usage,
 )
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats that are read; format 1 wrote a prompt as `prompt_ids: [kept, *new]`."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class Trajectory:
         return self.status == "completed"
 
     def to_json(self) -> str:
-        """One line of JSON; the same trajectory gives the same bytes."""
+        """One line of JSON without its newline; the same trajectory gives the same bytes."""
         first = self.transitions[0].input if self.transitions else None
         data = {
             "format": FORMAT,
@@ -92,13 +95,21 @@ class Trajectory:
 
     @classmethod
     def from_json(cls, line: str) -> Trajectory:
-        """Read what :meth:`to_json` wrote.
+        """Read what `to_json` wrote.
 
         Raises:
             ValueError: not a trajectory, or of a format this version does not read.
         """
-        data = json.loads(line)
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
+        return cls.from_data(json.loads(line))
+
+    @classmethod
+    def from_data(cls, data: Any) -> Trajectory:
+        """The trajectory of a line that was parsed already.
+
+        Raises:
+            ValueError: as `from_json`.
+        """
+        if not isinstance(data, dict) or data.get("format") not in READABLE:
             found = data.get("format") if isinstance(data, dict) else type(data).__name__
             raise ValueError(f"not a trajectory of format {FORMAT} (found {found}); record it again with this version")
         return cls(
@@ -182,17 +193,6 @@ def replay(trajectory: Trajectory, make_env: Callable[[Task], Any]) -> list[str]
     return differences
 
 
-def jsonable(value: Any) -> Any:
-    """``value`` as plain JSON data: tuples become lists, numpy scalars numbers, anything else its ``str``."""
-    if isinstance(value, Mapping):
-        return {str(k): jsonable(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(v) for v in value]
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    return value.item() if hasattr(value, "item") else str(value)
-
-
 def _step_to_json(t: Transition) -> dict[str, Any]:
     decision = t.decision
     error = decision.action if isinstance(decision.action, ActionError) else None
@@ -252,7 +252,8 @@ def _calls_to_json(calls: Sequence[LLMCall]) -> list[dict[str, Any]]:
     for call in calls:
         shared = shared_prefix(before, call.prompt_ids)
         row = asdict(call)
-        row["prompt_ids"] = [shared, *call.prompt_ids[shared:]]
+        del row["prompt_ids"]
+        row["prompt"] = {"kept": shared, "new": list(call.prompt_ids[shared:])}
         rows.append(row)
         before = call.prompt_ids + (call.completions[0].token_ids if call.completions else ())
     return rows
@@ -262,7 +263,9 @@ def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:
     calls: list[LLMCall] = []
     before: tuple[int, ...] = ()
     for row in rows:
-        shared, *rest = row["prompt_ids"]
+        kept, new = _prompt_of(row)
+        if not 0 <= kept <= len(before):
+            raise ValueError(f"call {row['id']} keeps {kept} tokens of the {len(before)} before it")
         completions = tuple(
             Completion(
                 text=c["text"],
@@ -278,7 +281,7 @@ def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:
         call = LLMCall(
             id=row["id"],
             tag=CallTag(**row["tag"]),
-            prompt_ids=before[:shared] + tuple(rest),
+            prompt_ids=before[:kept] + tuple(new),
             completions=completions,
             sampling=Sampling(**sampling),
             usage=Usage(**row["usage"]),
@@ -288,3 +291,11 @@ def _calls_from_json(rows: Sequence[Mapping[str, Any]]) -> tuple[LLMCall, ...]:
         calls.append(call)
         before = call.prompt_ids + (call.completions[0].token_ids if call.completions else ())
     return tuple(calls)
+
+
+def _prompt_of(row: Mapping[str, Any]) -> tuple[int, Sequence[int]]:
+    """How many tokens a call's prompt keeps of those before it, and what follows them."""
+    if "prompt_ids" in row:  # format 1
+        kept, *new = row["prompt_ids"]
+        return kept, new
+    return row["prompt"]["kept"], row["prompt"]["new"]

@@ -4,8 +4,8 @@
 
 *Kills.* A run of six updates of a tiny random model (LoRA, the real recipe, a process of its own) is killed with
 SIGKILL at a random point after its start, and started again with ``resume: true``. It counts as equal if the final
-adapter is bitwise that of the uninterrupted run, and so are the receipts of all updates and, but for times, the logged
-metrics.
+adapter is bitwise that of the uninterrupted run, and so are the receipts of all updates (but for the digests of records
+that hold times) and, but for times, the logged metrics. Its records must pass the audit.
 
 *Faults.* One update from 200 episodes, 50 groups of four, is made twice: with healthy environments, and with 10 % that
 crash, 5 % that hang and 5 % that pay NaN. A group without a failure must contribute exactly the same rows.
@@ -27,6 +27,8 @@ import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
+
+from benchmarks.edits import findings
 
 FAULTS = {"crash": 0.10, "hang": 0.05, "nan": 0.05}
 GROUP = 4
@@ -50,7 +52,10 @@ def main() -> None:
     if options.json:
         print(json.dumps(result))
         return
-    print(f"killed {result['kills']} times, {result['resumed_equal']} resumed runs equal the uninterrupted one")
+    print(
+        f"killed {result['kills']} times, {result['resumed_equal']} resumed runs equal the uninterrupted one; "
+        f"{result['audit_violations']} violations in their records"
+    )
     print(
         f"{result['episodes']} episodes, {result['unscorable']} failed; of {result['healthy_groups']} groups without a "
         f"failure {result['healthy_groups_changed']} changed"
@@ -123,7 +128,7 @@ def kill_runs(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     rng = random.Random(options.seed)
     config = write_config(folder / "whole.yaml", model, folder / "whole", options.steps)
     seconds = finish(config, folder / "whole")
-    equal, points, killed = 0, [], 0
+    equal, points, killed, violations = 0, [], 0, 0
     while killed < options.kills:
         run = folder / f"run-{len(points)}"
         config = write_config(folder / f"{run.name}.yaml", model, run, options.steps)
@@ -134,9 +139,18 @@ def kill_runs(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
         finish(config, run)
         same = outcome(run) == outcome(folder / "whole")
         equal += same
+        found = findings(run)
+        violations += len(found)
+        for violation in found[:3]:
+            print(f"kill {killed} with checkpoints {points[-1]}: {violation}", file=sys.stderr)
         if not same:
             print(f"kill {killed} with checkpoints {points[-1]}: the resumed run differs", file=sys.stderr)
-    return {"kills": killed, "resumed_equal": equal, "checkpoints_at_kill": points}
+    return {
+        "kills": killed,
+        "resumed_equal": equal,
+        "audit_violations": violations,
+        "checkpoints_at_kill": points,
+    }
 
 
 def start(config: Path, log: Path) -> subprocess.Popen[bytes]:
@@ -148,13 +162,12 @@ def start(config: Path, log: Path) -> subprocess.Popen[bytes]:
 
 
 def finish(config: Path, run: Path) -> float:
-    """Run to the end; seconds from the manifest (training begins) to the final weights.
+    """Run to the end; seconds from the manifest of a new run (training begins) to the final weights.
 
     Raises:
         RuntimeError: the run failed.
     """
     log = run.with_suffix(".log")
-    (run / "manifest.json").unlink(missing_ok=True)
     process = start(config, log)
     began = wait_for(run / "manifest.json", process)
     ended = wait_for(run / "adapter_model.safetensors", process)
@@ -188,7 +201,8 @@ def outcome(run: Path) -> tuple[Any, ...]:
     weights = load_file(run / "adapter_model.safetensors")
     log = RunLog(run)
     metrics = [{k: v for k, v in r.items() if "time" not in k} for r in log.read("metrics.jsonl")]
-    return {n: w.numpy().tobytes() for n, w in weights.items()}, log.read("updates.jsonl"), metrics
+    receipts = [{k: v for k, v in r.items() if k != "chain"} for r in log.read("updates.jsonl")]
+    return {n: w.numpy().tobytes() for n, w in weights.items()}, receipts, metrics
 
 
 # --- faults ----------------------------------------------------------------------------------------------------------

@@ -14,10 +14,10 @@ from typing import Any
 from update_modules import PAGE
 
 from agentspec.episode import Job, Runner
+from agentspec.files import write_atomic
 from agentspec.llm.local import LocalLLM
 from agentspec.registry import REGISTRY
 from agentspec.spec import AgentSpec
-from agentspec.state import write_atomic
 from agentspec.types import Task
 
 BEGIN, END = "<!-- generated: measured costs -->", "<!-- end of costs -->"

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from agentspec.files import write_atomic
 from agentspec.registry import REGISTRY, Entry
-from agentspec.state import write_atomic
 
 PAGE = Path(__file__).with_name("modules.md")
 BEGIN, END = "<!-- generated: call profiles -->", "<!-- end -->"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from trl import GRPOConfig
 
-from agentspec.state import write_atomic
+from agentspec.files import write_atomic
 from trainers.fields import FieldRule, field_rules
 
 PAGE = Path(__file__).with_name("training_fields.md")

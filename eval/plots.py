@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from agentspec.state import write_atomic
+from agentspec.files import write_atomic
 from eval.metrics import BY_NAME, METRICS
 from eval.tables import CellSummary
 

@@ -6,14 +6,11 @@ interrupted append can do is a last line without its end; it is cut off when the
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from agentspec.state import write_atomic
-from agentspec.trajectory import jsonable
+from agentspec.files import append_lines, jsonable, parse_line, repair_lines, whole_lines, write_lines
 
 Cell = tuple[str, str, str, int]
 """(policy, scaffold, task key, rollout): what one line is about."""
@@ -22,10 +19,6 @@ Cell = tuple[str, str, str, int]
 def cell_of(row: Mapping[str, Any]) -> Cell:
     """The cell of a row."""
     return row["policy"], row["scaffold"], row["task"], int(row["rollout"])
-
-
-def _line(row: Mapping[str, Any]) -> str:
-    return json.dumps(row, sort_keys=True, ensure_ascii=False) + "\n"
 
 
 class Results:
@@ -56,11 +49,7 @@ class Results:
     def append(self, row: Mapping[str, Any]) -> None:
         """Add a row, on disk at once."""
         data = jsonable(row)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path, "a", encoding="utf-8") as file:
-            file.write(_line(data))
-            file.flush()
-            os.fsync(file.fileno())
+        append_lines(self.path, data)
         self.by_cell[cell_of(data)] = data
 
     def discard(self, cells: Iterable[Cell]) -> None:
@@ -69,18 +58,13 @@ class Results:
         if not unwanted:
             return
         self.by_cell = {cell: row for cell, row in self.by_cell.items() if cell not in unwanted}
-        write_atomic(self.path, "".join(_line(row) for row in self.by_cell.values()))
+        write_lines(self.path, self.by_cell.values())
 
     def _read(self) -> None:
-        blob = self.path.read_bytes()
-        whole = blob.rfind(b"\n") + 1
-        if whole < len(blob):
-            os.truncate(self.path, whole)
-        for number, line in enumerate(blob[:whole].decode("utf-8").split("\n"), 1):
-            if not line.strip():
-                continue
+        repair_lines(self.path)
+        for number, line in whole_lines(self.path):
             try:
-                row = json.loads(line)
+                row = parse_line(self.path, number, line)
                 self.by_cell[cell_of(row)] = row
             except (ValueError, KeyError, TypeError) as error:
                 raise ValueError(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agentspec.state import write_atomic
+from agentspec.files import write_atomic
 from eval.metrics import BY_NAME, CUT_SHORT, METRICS, primary_metric
 from eval.statistics import Estimate, bootstrap, paired_difference
 

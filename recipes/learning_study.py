@@ -76,8 +76,8 @@ def train(path: str, seed: int, folder: Path) -> None:
 
 def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], out: Path) -> None:
     """Play the matrix and write tables and curves."""
+    from agentspec.files import write_atomic
     from agentspec.llm.models import resolve_adapter
-    from agentspec.state import write_atomic
     from eval.matrix import Policy, evaluate
     from eval.plots import learning_curves
     from eval.tables import write_report

@@ -37,7 +37,7 @@ def main() -> None:
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     """Two trials of every held-out task with either reflector: rows, also in `folder` with their table."""
     from agentspec.episode import Job, Runner
-    from agentspec.state import write_atomic
+    from agentspec.files import write_atomic
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import has_lesson, play_trials, routed_llm
     from trainers.rollouts import make_tasks

@@ -26,7 +26,7 @@ def train_warmup(config: Any) -> None:
     from datasets import Dataset
     from trl import SFTConfig
 
-    from agentspec.state import write_atomic
+    from agentspec.files import write_atomic
     from trainers.card import model_card
     from trainers.config import CHECKPOINTING
     from trainers.demonstrations import DemonstrationTrainer, demonstrate

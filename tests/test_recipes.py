@@ -21,8 +21,8 @@ from recipes.common import CONFIGS, run_recipe
 from trainers.arguments import OURS, merged, parse_config, read_config
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
-from trainers.resume import last_complete_checkpoint
 from trainers.run import train
+from trainers.run_folder import last_complete_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 ON_CPU = ["--use_cpu", "true", "--bf16", "false", "--report_to", "none"]

@@ -1,41 +1,45 @@
 """The audit of a run: every update checked against the episodes it claims to come from.
 
-The log holds the episodes of each generation round (with every sampled token) and a receipt written when the update was
-made (with a digest of every row the loss read). The audit rebuilds the rows from the episodes alone and checks that
+First that the records are those that were written (`trainers.chain`): no record of any file was edited, deleted, added
+or moved. Then that they say the truth: the receipt of every update is made anew from its episodes and its manifest and
+compared field by field, so that
 
-- every trained token was sampled by the policy, in that episode, at that place, after exactly that prompt;
+- every trained token was sampled by the policy, in that episode, at that place, after exactly that prompt, among what
+  its constraint left, with the recorded log-probability and temperature (`trainers.provenance`);
 - masks cover model tokens only, and none that a constraint forced;
-- the advantage of every row is what the declared estimator gives for the returns (constant over a rollout unless the
-  estimator is one per step), and advantages of a group sum to zero;
-- the loss denominator is the number of trained tokens; rows that were padded in train nothing; rollouts that could not
-  be scored have no rows.
+- the advantage of every row is what the declared estimator gives for the returns, and those of a group sum to zero
+  where the estimator says so;
+- the loss denominator is the number of trained tokens; padding rows train nothing; rollouts that could not be scored
+  have no rows; the settings of the loss are those of the manifest.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from agentspec.registry import SpecError
-from agentspec.trajectory import Trajectory, read_trajectories
-from agentspec.types import LLMCall
-from trainers.credit import CreditRule, ScoredEpisode
+from agentspec.trajectory import Trajectory
+from trainers.chain import Manifests, check_end, files_of, linked_receipts, read_round
+from trainers.credit import CreditRule
 from trainers.estimators import estimator
-from trainers.runlog import RunLog
-from trainers.sequences import Row, TokenSequence
+from trainers.provenance import check_completion, check_tokens
+from trainers.receipts import receipt_record, receipt_rows, settings
+from trainers.run_folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
+from trainers.sequences import Row
 
 TOLERANCE = 1e-6
+SHOWN = 5
+"""Differences of one kind that are listed one by one."""
 
 
 @dataclass
-class Receipt:
-    """What the audit found of one update."""
+class UpdateAudit:
+    """What the audit found of one update; `notes` say what it could not look at."""
 
     round: int
     episodes: int = 0
@@ -48,211 +52,201 @@ class Receipt:
     zero_gradient_rows: int = 0
     by_tag: dict[str, int] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The receipt as text."""
+        """The finding as text."""
         tags = ", ".join(f"{tag} {count}" for tag, count in sorted(self.by_tag.items())) or "none"
         head = (
             f"update {self.round}: {self.episodes} episodes ({self.unscorable} unscorable) -> {self.rows} rows "
-            f"({self.zero_gradient_rows} without gradient, {self.padding_rows} of padding), {self.tokens} tokens, "
+            f"({self.zero_gradient_rows} without gradient, {self.padding_rows} padding), {self.tokens} tokens, "
             f"{self.trained} trained = denominator {self.denominator}; trained by call: {tags}"
         )
-        return [head, *(f"  VIOLATION {v}" for v in self.violations)]
+        return [head, *(f"  VIOLATION {v}" for v in self.violations), *(f"  note: {n}" for n in self.notes)]
 
 
-def row_digest(tokens: Sequence[int], mask: Sequence[int], advantage: float | Sequence[float]) -> str:
-    """16 hex digits over what the loss reads of one row; advantages to seven digits."""
-    values = [advantage] if isinstance(advantage, (int, float)) else list(advantage)
-    data = [list(tokens), list(mask), [f"{v:.6e}" for v in values]]
-    return hashlib.sha256(json.dumps(data).encode()).hexdigest()[:16]
-
-
-def receipt_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """What the trainer writes of each row into its receipt."""
-    return [
-        {
-            "episode": r.episode,
-            "tokens": len(r.sequence),
-            "trained": r.sequence.trained,
-            "advantage": r.advantage,
-            "digest": row_digest(r.sequence.tokens, r.sequence.mask, r.advantage),
-        }
-        for r in rows
-    ]
-
-
-def audit(run: str | Path, step: int | None = None) -> Iterator[Receipt]:
+def audit(run: str | Path, step: int | None = None, *, head: str = "") -> Iterator[UpdateAudit]:
     """Audit every update of a run folder, or one.
+
+    What is wrong with the run as a whole is told of its first (the manifest) or last update (whatever has no receipt,
+    the seal); with `step`, the end of the run is not looked at.
+
+    Args:
+        run: the run's `output_dir`.
+        step: only the update of this generation round.
+        head: the head of the chain that the run printed at its end, kept outside the folder.
 
     Raises:
         SpecError: the folder holds no run, or no such update.
     """
     folder = Path(run)
-    if not (folder / "manifest.json").is_file() or not (folder / "updates.jsonl").is_file():
+    if not (folder / MANIFEST).is_file() or not ((folder / UPDATES).is_file() or (folder / TRAJECTORIES).is_dir()):
+        missing = "its manifest.json was removed" if holds_run(folder) and not (folder / MANIFEST).is_file() else ""
         raise SpecError(
-            f"{folder} holds no training run: expected manifest.json and updates.jsonl; give the run's output_dir"
+            f"{folder} holds no training run: expected manifest.json and updates.jsonl"
+            f"{f' ({missing})' if missing else ''}; give the run's output_dir"
         )
-    manifest = _manifest(folder / "manifest.json")
-    records = RunLog(folder).read("updates.jsonl")
-    if step is not None:
-        records = [r for r in records if r["round"] == step]
-        if not records:
-            raise SpecError(
-                f"{folder} has no update {step}; it has {[r['round'] for r in RunLog(folder).read('updates.jsonl')]}"
-            )
-    rule = CreditRule.from_manifest(manifest["config"])
-    for record in records:
-        yield _audit_update(folder, record, rule)
+    manifests = Manifests.read(folder)
+    seen: list[tuple[int, set[str], int]] = []
+    waiting: UpdateAudit | None = None
+    problems = list(manifests.problems)
+    for record, broken in linked_receipts(folder):
+        number = record["round"] if isinstance(record.get("round"), int) else -1
+        seen.append((number, set(files_of(record)), _steps_per_round(record)))
+        if step is not None and number != step:
+            continue
+        if waiting is not None:
+            yield waiting
+        waiting = _audit_update(folder, number, record, manifests, [*problems, *broken])
+        problems = []
+    if step is not None and waiting is None:
+        raise SpecError(f"{folder} has no update {step}; it has {[number for number, _, _ in seen]}")
+    last = waiting or UpdateAudit(-1, violations=problems)
+    if step is None:
+        wrong, notes = check_end(folder, seen, head)
+        last.violations += wrong
+        last.notes += notes
+    if waiting is not None or last.violations:
+        yield last
 
 
-def _manifest(path: Path) -> dict[str, Any]:
-    """The run's manifest.
+def _steps_per_round(record: Mapping[str, Any]) -> int:
+    """Optimiser steps that are made of one generation round."""
+    given = record.get("settings")
+    names = ("steps_per_generation", "num_iterations", "gradient_accumulation_steps")
+    values = [given.get(name) for name in names] if isinstance(given, Mapping) else []
+    counts = [v for v in values if isinstance(v, int) and v > 0]
+    return max(1, counts[0] * counts[1] // counts[2]) if len(counts) == 3 else 1
 
-    Raises:
-        SpecError: not the manifest of a training run.
-    """
+
+def _audit_update(
+    folder: Path, number: int, record: Mapping[str, Any], manifests: Manifests, problems: list[str]
+) -> UpdateAudit:
+    finding = UpdateAudit(number, violations=problems)
+    config = manifests.of(record, problems)["config"]
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise SpecError(f"{path} is not JSON ({error}); the run's record is damaged") from error
-    if not isinstance(data, dict) or not isinstance(data.get("config"), dict):
-        raise SpecError(f"{path} names no configuration: it is not the manifest of a training run")
-    return data
+        finding.denominator, finding.padding_rows = int(record["denominator"]), int(record["padding_rows"])
+        episodes = read_round(folder, record, problems)
+        finding.episodes = len(episodes)
+        finding.unscorable = sum(not t.scorable for t in episodes)
+        if not episodes:
+            problems.append(f"the episodes of this update are missing ({folder / TRAJECTORIES})")
+            return finding
+        _check_update(finding, record, episodes, config)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        problems.append(f"the record cannot be followed ({type(error).__name__}: {error})")
+    return finding
 
 
-def _audit_update(folder: Path, record: dict[str, Any], rule: CreditRule) -> Receipt:
-    receipt = Receipt(record["round"], denominator=record["denominator"], padding_rows=record["padding_rows"])
-    files = sorted((folder / "trajectories").glob(f"{record['round']:06d}*.jsonl"))
-    if not files:
-        receipt.violations.append(f"the episodes of this update are missing ({folder}/trajectories)")
-        return receipt
-    episodes = [t for f in sorted(files, key=_rank) for t in read_trajectories(f)]
-    receipt.episodes = len(episodes)
-    receipt.unscorable = sum(not t.scorable for t in episodes)
-    scored = rule.score(episodes)
-    _check_identity(scored, record, receipt)
+def _check_update(
+    finding: UpdateAudit, record: Mapping[str, Any], episodes: Sequence[Trajectory], config: Mapping[str, Any]
+) -> None:
+    """The receipt, made anew from its episodes and the manifest, and what it may not contain."""
+    rule = CreditRule.from_manifest(config)
     if len(episodes) % rule.group:
-        receipt.violations.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
-        return receipt
-    credited = rule.credit(scored)
-    _check_rows(credited.rows, episodes, record, receipt)
-    _check_advantages(credited.rows, episodes, rule, receipt)
-    for row in credited.rows:
-        _check_tokens(row.sequence, episodes[row.episode], receipt)
-    receipt.rows = len(credited.rows)
-    receipt.zero_gradient_rows = sum(r.zero_gradient for r in credited.rows)
-    receipt.tokens = sum(len(r.sequence) for r in credited.rows)
-    receipt.trained = sum(r.sequence.trained for r in credited.rows)
-    if receipt.trained != receipt.denominator:
-        receipt.violations.append(f"denominator {receipt.denominator}, but {receipt.trained} tokens are trained")
-    return receipt
+        finding.violations.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
+        return
+    scored = rule.score(episodes)
+    rows = rule.credit(scored).rows
+    finding.rows = len(rows)
+    finding.zero_gradient_rows = sum(r.zero_gradient for r in rows)
+    finding.tokens = sum(len(r.sequence) for r in rows)
+    finding.trained = sum(r.sequence.trained for r in rows)
+    again = receipt_record(
+        round=finding.round,
+        played=[(e.trajectory.episode, e.total) for e in scored],
+        rows=receipt_rows(rows),
+        padding_rows=padding_rows(rows, len(episodes), _ranks(record), config["steps_per_generation"]),
+        denominator=finding.trained,
+        settings=settings(config),
+    )
+    given = {name: value for name, value in record.items() if name != "chain"}
+    differences = list(_differences(again, given))
+    finding.violations += [f"{UPDATES}, update {finding.round}: {what}" for what in differences[:SHOWN]]
+    if len(differences) > SHOWN:
+        finding.violations.append(f"{UPDATES}, update {finding.round}: {len(differences) - SHOWN} more fields differ")
+    _check_policy(finding, episodes)
+    _check_advantages(finding, rows, episodes, rule)
+    _check_samples(finding, rows, episodes)
 
 
-def _rank(path: Path) -> int:
-    return int(path.stem.partition(".rank")[2] or 0)
+def _ranks(record: Mapping[str, Any]) -> int:
+    """Processes that played the round: each has a file of its own."""
+    return max(1, sum(name.startswith(f"{TRAJECTORIES}/") for name in files_of(record)))
 
 
-def _check_identity(scored: Sequence[ScoredEpisode], record: dict[str, Any], receipt: Receipt) -> None:
-    """The episodes are those of the receipt, with its returns, played by the policy of this update."""
-    episodes = [e.trajectory for e in scored]
-    if [t.episode for t in episodes] != record["episodes"]:
-        receipt.violations.append("the logged episodes are not those of the receipt")
-    else:
-        for episode, logged in zip(scored, record["returns"], strict=True):
-            value = episode.total
-            if not _equal(value, logged):
-                receipt.violations.append(
-                    f"{episode.trajectory.episode} returned {value}, but the receipt says {logged}"
-                )
-    expected = f"step-{record['round']}"
-    strangers = [t.episode for t in episodes if t.policy != expected]
-    if strangers:
-        receipt.violations.append(f"episodes {strangers} were not played by policy {expected}")
+def padding_rows(rows: Sequence[Row], episodes: int, ranks: int, micro_batches: int) -> int:
+    """Rows that fill up the micro-batches of all ranks: each has as many as the fullest one of any rank."""
+    held = Counter(row.episode * ranks // episodes for row in rows)
+    size = max(-(-max(1, held[rank]) // micro_batches) for rank in range(ranks))
+    return ranks * micro_batches * size - len(rows)
 
 
-def _check_rows(rows: Sequence[Row], episodes: Sequence[Trajectory], record: dict[str, Any], receipt: Receipt) -> None:
-    """The rows rebuilt from the episodes are those the loss read, and the receipt describes them truly."""
-    rebuilt = {(r["episode"], r["digest"]): r for r in receipt_rows(rows)}
-    mine = Counter((r["episode"], r["digest"]) for r in receipt_rows(rows))
-    theirs = Counter((r["episode"], r["digest"]) for r in record["rows"])
-    if mine != theirs:
-        differing = sum(((mine - theirs) + (theirs - mine)).values())
-        receipt.violations.append(f"{differing} rows of the update are not what its episodes give")
-    for row in record["rows"]:
-        known = 0 <= row["episode"] < len(episodes)
-        if not known or not episodes[row["episode"]].scorable:
-            what = "could not be scored" if known else "does not exist"
-            receipt.violations.append(f"episode {row['episode']} {what}, yet has a row")
-        given = rebuilt.get((row["episode"], row["digest"]), row)
-        for name in ("tokens", "trained", "advantage"):
-            if not _equal(given[name], row[name]):
-                receipt.violations.append(
-                    f"a row of episode {row['episode']} has {name} {given[name]}, but the receipt says {row[name]}"
-                )
+def _differences(again: Any, given: Any, where: str = "") -> Iterator[str]:
+    """Every leaf at which a receipt is not what its episodes and its manifest give."""
+    if isinstance(again, Mapping) and isinstance(given, Mapping):
+        for name in sorted({*again, *given}):
+            path = f"{where}.{name}" if where else str(name)
+            if name not in again or name not in given:
+                yield f"{path} {'stands in the receipt only' if name in given else 'is missing'}"
+            else:
+                yield from _differences(again[name], given[name], path)
+    elif isinstance(again, (list, tuple)) and isinstance(given, (list, tuple)):
+        if len(again) != len(given):
+            yield f"{where}: {len(given)} in the receipt, {len(again)} by its episodes"
+        for i, (a, b) in enumerate(zip(again, given, strict=False)):
+            yield from _differences(a, b, f"{where}[{i}]")
+    elif not _equal(again, given):
+        yield f"{where} is {again!r} by the episodes and the manifest, but the receipt says {given!r}"
 
 
 def _equal(a: Any, b: Any) -> bool:
-    """Numbers, or lists of numbers, equal up to the tolerance; ``None`` equals itself only."""
-    if a is None or b is None:
-        return a is b
-    left, right = ([x] if isinstance(x, (int, float)) else list(x) for x in (a, b))
-    return len(left) == len(right) and all(
-        math.isclose(x, y, rel_tol=TOLERANCE, abs_tol=TOLERANCE) for x, y in zip(left, right, strict=True)
-    )
+    """The same type of value, numbers up to the tolerance."""
+    if isinstance(a, float) and isinstance(b, (int, float)) and not isinstance(b, bool):
+        return math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+    return type(a) is type(b) and bool(a == b)
 
 
-def _check_advantages(rows: Sequence[Row], episodes: Sequence[Trajectory], rule: CreditRule, receipt: Receipt) -> None:
-    """Constant over a rollout, and zero in sum over a group (estimators per episode)."""
+def _check_policy(finding: UpdateAudit, episodes: Sequence[Trajectory]) -> None:
+    """Every episode was played by the policy of this update."""
+    expected = f"step-{finding.round}"
+    strangers = [t.episode for t in episodes if t.policy != expected]
+    if strangers:
+        finding.violations.append(f"episodes {strangers} were not played by policy {expected}")
+
+
+def _check_advantages(
+    finding: UpdateAudit, rows: Sequence[Row], episodes: Sequence[Trajectory], rule: CreditRule
+) -> None:
+    """Constant over a rollout (estimators per episode), and zero in sum over a group where the estimator says so."""
     spec = estimator(rule.estimator)
     if spec.per_step:
         return
     values: dict[int, float] = {}
     for row in rows:
-        assert isinstance(row.advantage, float)
-        if values.setdefault(row.episode, row.advantage) != row.advantage:
-            receipt.violations.append(f"episode {row.episode} has rows with different advantages")
+        if not isinstance(row.advantage, float) or values.setdefault(row.episode, row.advantage) != row.advantage:
+            finding.violations.append(f"episode {row.episode} has rows with different advantages")
     if rule.normalize == "rollout" or not spec.zero_sum:
-        return  # each rollout's value is scaled by its own length; the digests have compared the values already
-    size = rule.group
-    for start in range(0, len(episodes), size):
-        members = [i for i in range(start, start + size) if episodes[i].scorable]
-        if all(i in values for i in members):  # masked members have no rows to sum over
-            total = math.fsum(values[i] for i in members)
-            if abs(total) > TOLERANCE * max(1, size):
-                receipt.violations.append(f"advantages of group {start // size} sum to {total:.2g}, not 0")
+        return  # each rollout's value is scaled by its own length; they were compared one by one already
+    for start in range(0, len(episodes), rule.group):
+        members = [i for i in range(start, start + rule.group) if episodes[i].scorable]
+        if all(i in values for i in members):  # masked or skipped members have no rows to sum over
+            given = [values[i] for i in members]
+            if abs(math.fsum(given)) > TOLERANCE * max(1.0, math.fsum(map(abs, given))):
+                finding.violations.append(
+                    f"advantages of group {start // rule.group} sum to {math.fsum(given):.2g}, not 0"
+                )
 
 
-def _check_tokens(sequence: TokenSequence, trajectory: Trajectory, receipt: Receipt) -> None:
-    """Each trained token is a token of a completion, after exactly the prompt it was sampled from."""
-    calls = {c.id: c for c in trajectory.calls}
-    position = 0
-    while position < len(sequence):
-        owner = sequence.calls[position]
-        end = position + 1
-        while end < len(sequence) and sequence.calls[end] == owner:
-            end += 1
-        trained = sum(sequence.mask[position:end])
-        if owner < 0:
-            if trained:
-                receipt.violations.append(f"{trained} tokens that no call sampled are trained in {trajectory.episode}")
-        else:
-            _check_run(sequence, position, end, calls[owner], trajectory, receipt)
-            path = calls[owner].tag.path
-            receipt.by_tag[path] = receipt.by_tag.get(path, 0) + trained
-        position = end
-
-
-def _check_run(
-    sequence: TokenSequence, start: int, end: int, call: LLMCall, trajectory: Trajectory, receipt: Receipt
-) -> None:
-    tokens = tuple(sequence.tokens[start:end])
-    matching = [c for c in call.completions if c.token_ids == tokens]
-    where = f"call {call.id} of {trajectory.episode}"
-    if not matching:
-        receipt.violations.append(f"tokens {start}..{end} are no completion of {where}")
-        return
-    if tuple(sequence.tokens[:start]) != call.prompt_ids:
-        receipt.violations.append(f"the tokens before position {start} are not the prompt of {where}")
-    forced = [i for i, a in enumerate(matching[0].allowed) if a is not None and len(a) == 1]
-    if any(sequence.mask[start + i] for i in forced):
-        receipt.violations.append(f"{where} trains tokens that its constraint forced")
+def _check_samples(finding: UpdateAudit, rows: Sequence[Row], episodes: Sequence[Trajectory]) -> None:
+    """Every token of a row has an origin, and every recorded completion is possible."""
+    by_tag: Counter[str] = Counter()
+    for row in rows:
+        problems, counted = check_tokens(row.sequence, episodes[row.episode])
+        finding.violations += problems
+        by_tag += counted
+    finding.by_tag = dict(by_tag)
+    for trajectory in episodes:
+        for call in trajectory.calls:
+            for completion in call.completions:
+                finding.violations += check_completion(completion, f"call {call.id} of {trajectory.episode}")

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from agentspec.files import write_atomic
 from agentspec.llm.models import hub_id
-from agentspec.state import write_atomic
 
 if TYPE_CHECKING:
     from trl import GRPOTrainer as Base

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterable
@@ -19,11 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from agentspec.files import write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
 from agentspec.registry import SpecError
-from agentspec.state import write_atomic
 from agentspec.trajectory import versions
 from trainers.card import model_card
+from trainers.run_folder import checkpoints
 from trainers.runlog import RunLog
 
 MANIFEST = "agentspec.json"
@@ -110,10 +110,7 @@ def find_trained(run: Path) -> Trained:
     """
     if not run.is_dir():
         raise SpecError(f"no run folder {run}; give the output_dir of a training run")
-    checkpoints = [(int(m.group(1)), p) for p in run.iterdir() if (m := re.fullmatch(r"checkpoint-(\d+)", p.name))]
-    # The trainer writes its state last: a checkpoint without it was cut short.
-    complete = [p for _, p in sorted(checkpoints, reverse=True) if (p / "trainer_state.json").is_file()]
-    for folder in (run, *complete):
+    for folder in (run, *reversed(checkpoints(run))):
         if (folder / ADAPTER).is_file() and (folder / ADAPTER_CONFIG).is_file():
             return Trained(folder, adapter=True)
         single, sharded = folder / "model.safetensors", folder / "model.safetensors.index.json"

@@ -24,7 +24,6 @@ from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
-from trainers.audit import receipt_rows
 from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
@@ -34,9 +33,11 @@ from trainers.finite import FiniteGuard, require_finite, without_dropout
 from trainers.forward import rows_logprobs
 from trainers.losses import UpdateSize, divergence, loss
 from trainers.micro_batches import ROWS, collate, padding_row, partition
-from trainers.resume import ExactResume, last_complete_checkpoint, restore_finished, rewind_logs, set_aside
+from trainers.receipts import write_receipt
+from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, rollout_jobs, task_of
 from trainers.round_metrics import episode_metrics, round_metrics
+from trainers.run_folder import last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
@@ -96,21 +97,15 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
         self._largest_difference: list[torch.Tensor] = []
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
-        """As TRL's; first writes the run's manifest (configuration, scaffold, versions, command).
+        """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
 
         ``resume_from_checkpoint=True`` means the last complete checkpoint in ``output_dir``, if there is one.
         """
         if resume_from_checkpoint is True:
             resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
-        if self.accelerator.is_main_process:
-            if not resume_from_checkpoint:
-                set_aside(self.args.output_dir)
-            config, spec = self.args.to_dict(), self.args.spec.to_data()
-            self.run_log.manifest(config=config, spec=spec, resumed_from=str(resume_from_checkpoint or ""))
-            if not resume_from_checkpoint:
-                rewind_logs(self.run_log, 0)  # of a run that ended before its first checkpoint, say
-        finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
-        finished = finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
+        with self._recorded(str(resume_from_checkpoint or "")):
+            finished = restore_finished(self, resume_from_checkpoint) if resume_from_checkpoint else None
+            finished = finished or super().train(resume_from_checkpoint=resume_from_checkpoint or None, **kwargs)
         self._last_loaded_step = -1  # the weights may now be those of the best checkpoint
         return finished
 
@@ -342,22 +337,18 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
-        first = self.accelerator.process_index * len(self._played)
-        receipts = [{**r, "episode": first + r["episode"]} for r in receipt_rows(rows)]
-        padding = sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])
-        played = gather_object([(e.trajectory.episode, e.total) for e in self._played])
-        receipt = {
-            "round": self._round,
-            "episodes": [name for name, _ in played],
-            "returns": [value for _, value in played],
-            "rows": gather_object(receipts),
-            "padding_rows": sum(gather_object([padding])),
-            "denominator": int(self._buffered_inputs[0]["num_items_in_batch"]),
-            "estimator": self.args.estimator,
-            "loss_type": self.args.loss_type,
-        }
-        if self.accelerator.is_main_process:
-            self.run_log.append("updates.jsonl", receipt)
+        write_receipt(
+            self.run_log,
+            gather_object,
+            main=self.accelerator.is_main_process,
+            rank=self.accelerator.process_index,
+            round=self._round,
+            played=[(e.trajectory.episode, e.total) for e in self._played],
+            rows=rows,
+            padding_rows=sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS]),
+            denominator=int(self._buffered_inputs[0]["num_items_in_batch"]),
+            config=self.args.to_dict(),
+        )
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update

@@ -12,7 +12,8 @@ from __future__ import annotations
 import base64
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,20 +23,17 @@ from torch import nn
 from transformers import TrainerState
 from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotate_checkpoints
 
+from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from agentspec.state import write_atomic
+from trainers.folder_lock import hold
 from trainers.micro_batches import ROWS
+from trainers.run_folder import STATE, TRAINER_STATE, set_aside
 from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:
     from trl import GRPOTrainer as Base
 else:
     Base = object
-
-FILE = "scaffold_state.json"
-TRAINER_STATE = "trainer_state.json"
-EARLIER = "earlier"
-"""Folder of a run that holds the checkpoints of runs that were in its place before."""
 
 FORMAT = 2
 
@@ -71,48 +69,7 @@ def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
 
 def unmark(folder: str | Path) -> None:
     """Declare a checkpoint incomplete: it is about to be written (again)."""
-    (Path(folder) / FILE).unlink(missing_ok=True)
-
-
-def checkpoints(folder: str | Path) -> list[Path]:
-    """The checkpoints of a run that were written to their end, oldest first.
-
-    A run that was killed while saving leaves a folder without its last file, or (rotation cut short) without its
-    trainer state; both are passed over.
-    """
-    found = [
-        (int(number), path)
-        for path in Path(folder).glob(f"{PREFIX_CHECKPOINT_DIR}-*")
-        if (number := path.name.rpartition("-")[2]).isdigit()
-    ]
-    return [p for _, p in sorted(found) if (p / FILE).is_file() and (p / TRAINER_STATE).is_file()]
-
-
-def last_complete_checkpoint(folder: str | Path) -> Path | None:
-    """The newest of :func:`checkpoints`; ``None`` if there is none."""
-    return next(reversed(checkpoints(folder)), None)
-
-
-def set_aside(folder: str | Path) -> Path | None:
-    """Move the checkpoints of an earlier run into ``folder/earlier/N``, before a new run begins in ``folder``.
-
-    Otherwise a new run that is killed before its first checkpoint would resume from one of the earlier run, and its
-    rotation would delete them.
-
-    Returns:
-        where they are now; ``None`` if there were none.
-    """
-    found = checkpoints(folder)
-    if not found:
-        return None
-    earlier = Path(folder) / EARLIER
-    taken = [int(p.name) for p in earlier.glob("*") if p.name.isdigit()]
-    place = earlier / str(max(taken, default=0) + 1)
-    place.mkdir(parents=True)
-    for checkpoint in found:
-        checkpoint.rename(place / checkpoint.name)
-    print(f"note: a new run begins in {folder}; the checkpoints of the earlier one are in {place}", file=sys.stderr)
-    return place
+    (Path(folder) / STATE).unlink(missing_ok=True)
 
 
 def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None:
@@ -161,7 +118,7 @@ def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:
 
 
 def _name(rank: int) -> str:
-    return FILE if rank == 0 else FILE.replace(".json", f".rank{rank}.json")
+    return STATE if rank == 0 else STATE.replace(".json", f".rank{rank}.json")
 
 
 def _row_to_json(row: Row) -> dict[str, Any]:
@@ -179,11 +136,13 @@ def _row_from_json(data: dict[str, Any]) -> Row:
     return Row(TokenSequence(**fields), tuple(advantage) if isinstance(advantage, list) else advantage, data["episode"])
 
 
-def rewind_logs(log: Any, step: int) -> None:
-    """Drop what the logs hold beyond checkpoint ``step``: the resumed run writes it again."""
-    log.rewind("metrics.jsonl", "step", step)
-    log.rewind("updates.jsonl", "round", step - 1)
-    log.rewind("evaluations.jsonl", "step", step)
+def _step_of(checkpoint: Path) -> int:
+    """Optimiser steps before a checkpoint."""
+    path = checkpoint / TRAINER_STATE
+    if path.is_file():
+        return int(TrainerState.load_from_json(str(path)).global_step)
+    number = checkpoint.name.rpartition("-")[2]
+    return int(number) if number.isdigit() else 0
 
 
 def rows_of(batches: Sequence[dict[str, Any]] | None) -> tuple[tuple[Row, ...], ...]:
@@ -217,6 +176,33 @@ class ExactResume(Base):
             best = self.state.best_model_checkpoint
             rotate_checkpoints(run, save_total_limit=limit, best_model_checkpoint=best, use_mtime=True)
 
+    @contextmanager
+    def _recorded(self, checkpoint: str) -> Iterator[None]:
+        """The run's folder belongs to this run inside, and its manifest is written; the end seals its records.
+
+        What the folder holds beyond the checkpoint is dropped: the resumed run writes it again. A run that does not go
+        on from a checkpoint of this folder begins anew: what is there is set aside.
+
+        Raises:
+            SpecError: another run is writing into the folder.
+        """
+        if not self.accelerator.is_main_process:
+            self.accelerator.wait_for_everyone()  # nobody writes before the main process has cleared the folder
+            yield
+            return
+        folder = Path(self.args.output_dir)
+        with hold(folder):
+            if not checkpoint or Path(checkpoint).resolve().parent != folder.resolve():
+                set_aside(folder)
+            else:
+                self.run_log.unseal()
+                self.run_log.rewind_to(_step_of(Path(checkpoint)))
+            config, spec = self.args.to_dict(), self.args.spec.to_data()
+            self.run_log.manifest(config=config, spec=spec, resumed_from=checkpoint)
+            self.accelerator.wait_for_everyone()
+            yield
+            print(f"records of {folder} sealed; head of the chain: {self.run_log.seal()}", file=sys.stderr)
+
     def _get_train_sampler(self, dataset: Any = None) -> Any:
         self._task_sampler = super()._get_train_sampler(dataset)
         return self._task_sampler
@@ -233,5 +219,3 @@ class ExactResume(Base):
         self._step, self._round, self._memory = state.step, state.round, state.memory
         if state.buffered:
             self._buffered_inputs = self._collated([list(rows) for rows in state.buffered])
-        if self.accelerator.is_main_process:
-            rewind_logs(self.run_log, self.state.global_step)

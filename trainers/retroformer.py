@@ -29,7 +29,7 @@ from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
 from agentspec.spec import AgentSpec, ModuleSpec
-from agentspec.trajectory import Trajectory, write_trajectories
+from agentspec.trajectory import Trajectory
 from trainers.checks import REFLECTION, REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, ScoredEpisode
@@ -118,8 +118,7 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         ):
             if values:
                 self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
-        name = f"{self._round:06d}.rank{self.accelerator.process_index}.jsonl"
-        write_trajectories(self.run_log.folder / FIRST_TRIALS / name, firsts)
+        self.run_log.trajectories(self._round, self.accelerator.process_index, firsts, FIRST_TRIALS)
 
 
 def play_trials(

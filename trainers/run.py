@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ from transformers import PrinterCallback, ProgressCallback
 
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
+from trainers.folder_lock import hold
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.report import Bar, TerminalReport
-from trainers.resume import last_complete_checkpoint
 from trainers.rollouts import make_tasks, task_rows
+from trainers.run_folder import last_complete_checkpoint
 
 
 def train(
@@ -41,7 +43,7 @@ def train(
         the trainer.
 
     Raises:
-        SpecError: the configuration cannot work.
+        SpecError: the configuration cannot work, or another run is writing into its folder.
         KeyboardInterrupt: after a line that says how to go on.
     """
     # Deprecations between libraries: nothing that whoever trains could change.
@@ -70,12 +72,13 @@ def train(
         say(f"note: {note}", file=sys.stderr)
     if last:
         say(f"resuming from {last}", file=sys.stderr)
-    try:
-        trainer.train(resume_from_checkpoint=str(last) if last else None)
-    except KeyboardInterrupt:
-        say(f"\n{_how_to_continue(folder)}", file=sys.stderr)
-        raise
-    trainer.save_model(str(folder))
+    with hold(folder) if trainer.accelerator.is_main_process else nullcontext():  # until the final model is saved
+        try:
+            trainer.train(resume_from_checkpoint=str(last) if last else None)
+        except KeyboardInterrupt:
+            say(f"\n{_how_to_continue(folder)}", file=sys.stderr)
+            raise
+        trainer.save_model(str(folder))
     return trainer
 
 

@@ -1,13 +1,17 @@
-"""What a run leaves behind: a manifest, every trajectory, and a receipt of every update.
-
-::
+"""What a run leaves behind, each file a link of one chain.
 
     runs/quickstart/
         manifest.json             config, spec, versions, command
+        manifests/000000.json     those before it: a resumed run has a new one, which names the digest of the one before
         trajectories/000001.jsonl one file per generation round
-        updates.jsonl             one receipt per generation round: rows, tokens, denominators, advantages
+        updates.jsonl             one receipt per generation round (`trainers.receipts`)
         metrics.jsonl             what the trainer logged
-        evaluations.jsonl         what evaluation while training found (eval_strategy: steps)
+        evaluations.jsonl         what evaluation while training found (`eval_strategy: steps`)
+        seal.json                 written when the run ends: its digest is the head of the chain
+
+A receipt holds the digests of its round's trajectory files, of the manifest and of the receipt before it; the seal
+holds those of the last receipt and of all logged lines. Whoever keeps the head can tell any later edit. Without it, an
+edit is told as long as its author does not compute every digest after it anew.
 """
 
 from __future__ import annotations
@@ -18,8 +22,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agentspec.state import write_atomic
-from agentspec.trajectory import Trajectory, jsonable, versions, write_trajectories
+from agentspec.files import (
+    append_lines,
+    digest,
+    file_digest,
+    jsonable,
+    last_line,
+    parse_line,
+    read_lines,
+    whole_lines,
+    write_atomic,
+)
+from agentspec.trajectory import Trajectory, versions
+from trainers.contents import contents, field_digests
+from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
+
+FORMAT = 2
+LOGGED = (METRICS, EVALUATIONS)
+"""Files that the seal covers line by line."""
 
 
 class RunLog:
@@ -27,24 +47,76 @@ class RunLog:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
+        self._written: dict[str, dict[str, Any]] = {}
+        self._read: dict[Path, tuple[tuple[int, int], str]] = {}
 
     def manifest(self, **fields: Any) -> None:
-        """Write ``manifest.json``: what was run, with which versions and command."""
-        data = {"command": sys.argv, "versions": versions(), **jsonable(fields)}
-        write_atomic(self.folder / "manifest.json", json.dumps(data, indent=2, sort_keys=True) + "\n")
+        """Write `manifest.json`: what was run, with which versions and command. One that is there is kept beside it."""
+        previous = self._keep_manifest()
+        data = {
+            "format": FORMAT,
+            "command": sys.argv,
+            "versions": versions(),
+            "previous": previous,
+            **jsonable(fields),
+        }
+        data["digests"] = field_digests(data)
+        write_atomic(self.folder / MANIFEST, json.dumps(data, indent=2, sort_keys=True) + "\n")
 
-    def trajectories(self, round: int, rank: int, trajectories: Sequence[Trajectory]) -> None:
-        """Write this rank's episodes of one generation round."""
-        name = f"{round:06d}.jsonl" if rank == 0 else f"{round:06d}.rank{rank}.jsonl"
-        write_trajectories(self.folder / "trajectories" / name, trajectories)
+    def _keep_manifest(self) -> str:
+        """Put the present manifest among the earlier ones; the digest of the newest of them, empty if there is none."""
+        kept = sorted((self.folder / MANIFESTS).glob("*.json"))
+        newest = file_digest(kept[-1]) if kept else ""
+        present = self.folder / MANIFEST
+        if present.is_file() and (found := file_digest(present)) != newest:
+            write_atomic(self.folder / MANIFESTS / f"{len(kept):06d}.json", present.read_bytes())
+            return found
+        return newest
+
+    def trajectories(self, round: int, rank: int, episodes: Sequence[Trajectory], kind: str = TRAJECTORIES) -> None:
+        """Write this rank's episodes of one generation round into the run's folder `kind`."""
+        name = f"{kind}/{round:06d}.jsonl" if rank == 0 else f"{kind}/{round:06d}.rank{rank}.jsonl"
+        lines = [episode.to_json() for episode in episodes]
+        blob = "".join(line + "\n" for line in lines)
+        write_atomic(self.folder / name, blob)
+        self._written[name] = {"digest": digest(blob), "episodes": [contents(json.loads(line)) for line in lines]}
+
+    def written(self) -> dict[str, dict[str, Any]]:
+        """File -> its `digest` and that of each of its `episodes` by class of field, since this was last asked."""
+        written, self._written = self._written, {}
+        return written
 
     def append(self, name: str, record: Mapping[str, Any]) -> None:
-        """Append one JSON line to ``name``; a line that a crash cut short is dropped first."""
+        """Append one JSON line to `name`. A run that had ended is sealed anew."""
+        append_lines(self.folder / name, record)
+        if (self.folder / SEAL).is_file():
+            self.seal()
+
+    def receipt(self, record: Mapping[str, Any], files: Mapping[str, Any]) -> None:
+        """Append a receipt, chained to the one before it, the manifest and its round's files (as of `written`)."""
+        chain = {"manifest": self._digest(MANIFEST), "files": dict(files), "previous": last_digest(self.folder)}
+        append_lines(self.folder / UPDATES, {**record, "chain": chain})
+
+    def _digest(self, name: str) -> str:
+        """Digest of a file, read again only if it was written since."""
         path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        drop_partial_line(path)
-        with open(path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(jsonable(record), sort_keys=True) + "\n")
+        if not path.is_file():
+            return ""
+        stat = path.stat()
+        known = self._read.get(path)
+        if known is None or known[0] != (stat.st_mtime_ns, stat.st_ino):
+            known = self._read[path] = ((stat.st_mtime_ns, stat.st_ino), file_digest(path))
+        return known[1]
+
+    def seal(self) -> str:
+        """End the chain; returns its head, the digest of the seal."""
+        blob = json.dumps(seal_of(self.folder), indent=1, sort_keys=True) + "\n"
+        write_atomic(self.folder / SEAL, blob)
+        return digest(blob)
+
+    def unseal(self) -> None:
+        """The run goes on."""
+        (self.folder / SEAL).unlink(missing_ok=True)
 
     def read(self, name: str) -> list[dict[str, Any]]:
         """All whole records of a JSONL file of this run (none if it does not exist); the file stays as it is.
@@ -52,38 +124,51 @@ class RunLog:
         Raises:
             ValueError: naming file and line of what is not JSON.
         """
-        path = self.folder / name
-        if not path.is_file():
-            return []
-        whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
-        records = []
-        for number, line in enumerate(whole.split("\n"), 1):
-            if line.strip():
-                try:
-                    records.append(json.loads(line))
-                except ValueError as error:
-                    raise ValueError(f"{path}, line {number}: not JSON ({error}); the file was damaged") from error
-        return records
+        return read_lines(self.folder / name)
 
     def rewind(self, name: str, key: str, last: int) -> None:
-        """Drop records whose ``key`` exceeds ``last``: a resumed run writes them again."""
-        records = self.read(name)
-        kept = [r for r in records if r.get(key, 0) <= last]
-        if len(kept) < len(records):
-            write_atomic(self.folder / name, "".join(json.dumps(r, sort_keys=True) + "\n" for r in kept))
+        """Drop records whose `key` exceeds `last`: a resumed run writes them again. The others stay to the byte."""
+        path = self.folder / name
+        lines = [(parse_line(path, number, line), line) for number, line in whole_lines(path)]
+        kept = [line for record, line in lines if record.get(key, 0) <= last]
+        if len(kept) < len(lines):
+            write_atomic(path, b"".join(kept))
+
+    def rewind_to(self, step: int) -> None:
+        """Drop what the run holds beyond checkpoint `step`: the resumed run writes it again."""
+        self.rewind(METRICS, "step", step)
+        self.rewind(UPDATES, "round", step - 1)
+        self.rewind(EVALUATIONS, "step", step)
+        for path in round_files(self.folder):
+            if int(path.name[:6]) >= step:
+                path.unlink()
 
 
-def drop_partial_line(path: Path) -> None:
-    """Cut a last line without newline: the only damage an interrupted append can do."""
-    if not path.is_file() or path.stat().st_size == 0:
-        return
-    data = path.read_bytes()
-    if not data.endswith(b"\n"):
-        write_atomic(path, data[: data.rfind(b"\n") + 1])
+def round_files(folder: Path) -> list[Path]:
+    """The trajectory files of all rounds, in `trajectories` and in every other folder of the run that has some."""
+    return sorted(p for p in folder.glob("*/[0-9][0-9][0-9][0-9][0-9][0-9]*.jsonl") if p.is_file())
+
+
+def last_digest(folder: Path) -> str:
+    """Digest of the last receipt's line; empty if there is none."""
+    last = last_line(folder / UPDATES)
+    return digest(last) if last else ""
+
+
+def seal_of(folder: Path) -> dict[str, Any]:
+    """What a run's seal must hold."""
+    logs = {name: [digest(line)[:16] for _, line in whole_lines(folder / name)] for name in LOGGED}
+    return {
+        "format": FORMAT,
+        "updates": sum(1 for _ in whole_lines(folder / UPDATES)),
+        "last_receipt": last_digest(folder),
+        "manifest": file_digest(folder / MANIFEST) if (folder / MANIFEST).is_file() else "",
+        "logs": {name: lines for name, lines in logs.items() if lines},
+    }
 
 
 def paths_called(trajectories: Sequence[Trajectory]) -> set[str]:
-    """``module/purpose (credit)`` of everything that the episodes asked the model."""
+    """`module/purpose (credit)` of everything that the episodes asked the model."""
     return {f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions}
 
 

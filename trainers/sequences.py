@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 
+from agentspec.tags import matches
 from agentspec.trajectory import Trajectory
 from agentspec.types import Completion, Credit, LLMCall
 
@@ -36,22 +36,18 @@ class TrainFilter:
 
     def matches(self, path: str) -> bool:
         """Whether calls of ``path`` may be trained."""
-        return _matches(path, self.patterns)
+        return matches(path, self.patterns)
 
     def completions(self, call: LLMCall) -> list[Completion]:
         """The trained completions of ``call``."""
         if not self.matches(call.tag.path):
             return []
-        cut = _matches(call.tag.path, self.mask_truncated)
+        cut = matches(call.tag.path, self.mask_truncated)
         return [
             c
             for c in call.completions
             if c.credit in self.credits and c.token_ids and not (cut and c.finish_reason == "length")
         ]
-
-
-def _matches(path: str, patterns: SequenceOf[str]) -> bool:
-    return any(fnmatchcase(path, p if "/" in p else f"{p}/*") for p in patterns)
 
 
 @dataclass
@@ -157,7 +153,7 @@ def build_sequences(trajectory: Trajectory, train: TrainFilter | None = None) ->
 def trained_completions(trajectory: Trajectory, train: TrainFilter) -> list[tuple[LLMCall, Completion]]:
     """The completions of an episode that are trained, each with its call, in the order they were made."""
     roles = trajectory.spec.get("roles", {})
-    own = [call for call in trajectory.calls if not any(fnmatchcase(call.tag.module, role) for role in roles)]
+    own = [call for call in trajectory.calls if not matches(call.tag.path, roles)]
     return [(call, c) for call in own if call.tag.step < len(trajectory.transitions) for c in train.completions(call)]
 
 

@@ -14,12 +14,16 @@ def add_parser(commands: Any) -> None:
         "audit",
         help="verify every update of a training run",
         description=(
-            "Rebuild the rows of every update from the logged episodes and check tokens, masks, advantages and "
-            "denominators; prints a receipt per update. Exit code 1 if anything does not agree."
+            "Check that no record of the run was edited, then make the receipt of every update anew from its episodes: "
+            "tokens, log-probabilities, constraints, masks, advantages, denominators. Exit code 1 if anything does not "
+            "agree."
         ),
     )
     parser.add_argument("run", metavar="RUN", help="folder of the run (its output_dir)")
     parser.add_argument("--step", type=int, metavar="N", help="only the update of this optimiser step (default: all)")
+    parser.add_argument(
+        "--head", default="", metavar="DIGEST", help="head of the chain, as the run printed it when it ended"
+    )
     parser.add_argument("--json", action="store_true", help="print the receipts as JSON, one line each")
     parser.set_defaults(command=run)
 
@@ -29,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from trainers.audit import audit
 
     updates = violations = 0
-    for receipt in audit(arguments.run, arguments.step):
+    for receipt in audit(arguments.run, arguments.step, head=arguments.head):
         updates += 1
         violations += len(receipt.violations)
         if arguments.json:

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium
 
 from agentspec.episode import make_env
+from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from agentspec.state import write_atomic
 from agentspec.types import Task
 
 FRAME_MS = 400

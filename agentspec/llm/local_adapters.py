@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from fnmatch import fnmatchcase
 from typing import Any
 
 from agentspec.llm.base import LLMError
+from agentspec.tags import matches
 
 UNTAGGED = "/"
 """The tag path of what has no tag."""
@@ -45,7 +45,7 @@ def adapter_for(path: str, adapters: Mapping[str, str]) -> str:
     'actor'
     """
     for pattern, name in adapters.items():
-        if fnmatchcase(path, pattern if "/" in pattern else f"{pattern}/*"):
+        if matches(path, pattern):
             return name
     return ""
 

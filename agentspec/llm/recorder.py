@@ -11,11 +11,11 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 from agentspec.llm.base import LLM, LLMError, Message, Request
 from agentspec.llm.pricing import Prices
+from agentspec.tags import matches
 from agentspec.types import CallTag, Credit, LLMCall, Sampling, Usage
 
 
@@ -132,7 +132,7 @@ class Recorder:
 
     def backend(self, module: str) -> LLM:
         """Who answers the calls of `module`."""
-        return next((llm for pattern, llm in self.helpers.items() if fnmatchcase(module, pattern)), self.llm)
+        return next((llm for pattern, llm in self.helpers.items() if matches(f"{module}/", pattern)), self.llm)
 
     async def score(
         self, messages: Sequence[Message], continuations: Sequence[str], module: str = ""

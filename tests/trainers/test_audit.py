@@ -1,10 +1,12 @@
-"""The audit: an honest run passes; whatever is tampered with afterwards is a violation."""
+"""The audit: an honest run passes; whatever is edited afterwards is noticed, and named by file, record and field."""
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,21 @@ import pytest
 pytest.importorskip("trl")
 
 from agentspec.cli import main
+from agentspec.files import digest, file_digest
 from agentspec.registry import SpecError
+from benchmarks.edits import FILE_KINDS, KINDS, apply, edit
+from benchmarks.tamper import RUN, train
 from tests.toy_env import ToyEnv
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
-from trainers.audit import Receipt, _check_tokens, audit, row_digest
+from trainers.audit import UpdateAudit, _check_advantages, _check_samples, audit, padding_rows
+from trainers.contents import contents, differing
+from trainers.credit import CreditRule
+from trainers.estimators import ESTIMATORS
+from trainers.provenance import check_completion, check_tokens
+from trainers.receipts import row_digest
 from trainers.runlog import RunLog
-from trainers.sequences import build_sequences
+from trainers.sequences import Row, build_sequences
 
 SUPO = {
     "agent": {
@@ -40,8 +50,9 @@ def _crashing(task: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three updates: menus, a memory that asks the model, evaluation while training."""
     folder = tmp_path_factory.mktemp("audit") / "run"
-    toy_trainer(folder, num_generations=4, per_device_train_batch_size=4).train()
+    train(folder, **RUN)
     return folder
 
 
@@ -50,21 +61,38 @@ def copy(run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(run, tmp_path / "copy"))
 
 
-def violations(folder: Path) -> list[str]:
-    return [v for r in audit(folder) for v in r.violations]
+def violations(folder: Path, **options: Any) -> list[str]:
+    return [v for r in audit(folder, **options) for v in r.violations]
+
+
+# --- honest runs -----------------------------------------------------------------------------------------------------
 
 
 def test_an_honest_run_passes(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["audit", str(run)]) == 0
+    head = file_digest(run / "seal.json")
+    assert main(["audit", str(run), "--head", head]) == 0
     out = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in out[:2]] == ["update 0", "update 1"]
-    assert "8 episodes (0 unscorable)" in out[0] and "reasoning.direct/act" in out[0]
-    assert out[-1] == "2 updates audited: no violation"
+    assert [line.split(":")[0] for line in out[:3]] == ["update 0", "update 1", "update 2"]
+    assert "4 episodes (0 unscorable)" in out[0] and "reasoning.react/act" in out[0]
+    assert out[-1] == "3 updates audited: no violation"
     assert main(["audit", str(run), "--step", "1", "--json"]) == 0
-    (receipt,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (finding,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     # Every trained token is in the denominator, and nothing else.
-    assert receipt["round"] == 1 and receipt["trained"] == receipt["denominator"] > 0
-    assert sum(receipt["by_tag"].values()) == receipt["trained"]
+    assert finding["round"] == 1 and finding["trained"] == finding["denominator"] > 0
+    assert sum(finding["by_tag"].values()) == finding["trained"]
+
+
+def test_the_head_is_printed_at_the_end_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    toy_trainer(tmp_path, max_steps=1).train()
+    assert f"head of the chain: {file_digest(tmp_path / 'seal.json')}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_no_honest_estimator_is_a_violation(tmp_path: Path, estimator: str) -> None:
+    discount = {"gamma": 0.9} if "gamma" in ESTIMATORS[estimator].needs else {}
+    toy_trainer(tmp_path, estimator=estimator, max_steps=1, **discount).train()
+    (finding,) = audit(tmp_path)
+    assert (finding.violations, finding.notes) == ([], []) and finding.trained == finding.denominator > 0
 
 
 @pytest.mark.parametrize(
@@ -73,149 +101,230 @@ def test_an_honest_run_passes(run: Path, capsys: pytest.CaptureFixture[str]) -> 
         SUPO,
         REACT,
         {"estimator": "rloo", "packing": "padded"},
-        {"estimator": "gigpo", "gamma": 0.9},
         {"estimator": "reward_to_go", **SUPO},
+        {"normalize": "rollout", **SUPO},
         {"skip_zero_variance": True, "max_steps": 1},
         {"steps_per_generation": 4, "max_steps": 3},
+        {"num_iterations": 2, "max_steps": 3},
     ],
-    ids=["supo", "react-menu", "rloo", "gigpo", "supo-reward_to_go", "skip", "long-round"],
+    ids=["supo", "react-menu", "rloo", "supo-reward_to_go", "supo-rollout", "skip", "long-round", "iterations"],
 )
 def test_honest_runs_of_every_kind_pass(tmp_path: Path, changes: dict[str, Any]) -> None:
     settings = {"max_steps": 1, **changes}
     toy_trainer(tmp_path, **settings).train()
     receipts = list(audit(tmp_path))
-    assert receipts and not [v for r in receipts for v in r.violations]
+    assert receipts and not [(v, r.notes) for r in receipts for v in r.violations]
     assert all(r.trained == r.denominator for r in receipts)
     if changes.get("agent") == SUPO["agent"]:
         assert receipts[0].rows > receipts[0].episodes  # one row per segment
-    if changes is SUPO:
-        # Random summaries run into their limit and are then context only.
-        assert receipts[0].by_tag.get("memory.summary/summary", 0) >= 0
 
 
 def test_a_run_with_failed_rollouts_passes_and_counts_them(tmp_path: Path) -> None:
     toy_trainer(tmp_path, toy_tasks(2), make_env=_crashing, max_steps=1).train()
-    (receipt,) = audit(tmp_path)
-    assert (receipt.episodes, receipt.unscorable, receipt.violations) == (4, 2, [])
+    (finding,) = audit(tmp_path)
+    assert (finding.episodes, finding.unscorable, finding.violations) == (4, 2, [])
 
 
-# --- tampering -------------------------------------------------------------------------------------------------------
+# --- edits -----------------------------------------------------------------------------------------------------------
 
-Edit = Callable[[list[dict[str, Any]]], None]
+NAMED = {
+    "log-probabilities of all sampled tokens": "trajectories/000001.jsonl, record 1 .*: edited: log-probabilities",
+    "log-probability of a forced token": "record 1 .*: edited: log-probabilities",
+    "temperature of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
+    "top_p of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
+    "top_k of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
+    "constraint widened": "record 1 .*: edited: constraints",
+    "constraint without the sampled token": "its constraint does not hold token",
+    "constraint lifted": "record 1 .*: edited: constraints",
+    "sampled token": "record 1 .*: edited: tokens",
+    "action text": "record 1 .*: edited: actions",
+    "observation text": "record 1 .*: edited: observations",
+    "completion text": "record 1 .*: edited: completion texts",
+    "finish reason": "record 1 .*: edited: finish reasons",
+    "credit of a completion": "record 1 .*: edited: credits",
+    "spec of an episode": "record 1 .*: edited: spec",
+    "versions of an episode": "record 1 .*: edited: versions",
+    "policy of an episode": "not played by policy step-1",
+    "status of an episode": "record 1 .*: edited: identity",
+    "reward of a step": "record 1 .*: edited: rewards",
+    "the same added to all returns of a group": "record 2 .*: edited: metrics, rewards",
+    "an episode deleted": "has 3 records, the receipt names 4",
+    "episodes reordered": r"episodes\[0\] is .* but the receipt says",
+    "the first update deleted": r"record 1 was not the first: .*deleted",
+    "an update deleted": r"record 2 of updates.jsonl follows a record that is not here",
+    "the last update deleted": r"the last record of updates.jsonl is not that of seal.json .*: .* deleted",
+    "an update doubled": r"record 3 of updates.jsonl followed record 1: records were moved, deleted or doubled",
+    "updates reordered": r"moved, deleted or doubled",
+    "advantage in the receipt": r"updates.jsonl, update 1: rows\[0\].advantage is .* but the receipt says 9.0",
+    "denominator in the receipt": "updates.jsonl, update 1: denominator is .* but the receipt says 1",
+    "padding rows in the receipt": "updates.jsonl, update 1: padding_rows is .* but the receipt says 50",
+    "a row deleted from the receipt": "updates.jsonl, update 1: rows: ",
+    "a row added to the receipt": "updates.jsonl, update 1: rows: ",
+    "estimator in the receipt": "settings.estimator is 'grpo' by the .* manifest, but the receipt says 'rloo'",
+    "loss_type in the receipt": "settings.loss_type is 'dapo'",
+    "epsilon in the receipt": "settings.epsilon is",
+    "beta in the receipt": "settings.beta is",
+    "learning_rate in the receipt": "settings.learning_rate is",
+    "estimator in the manifest": "manifest.json: config.estimator was edited",
+    "loss_type in the manifest": "manifest.json: config.loss_type was edited",
+    "epsilon in the manifest": "manifest.json: config.epsilon was edited",
+    "beta in the manifest": "manifest.json: config.beta was edited",
+    "learning_rate in the manifest": "manifest.json: config.learning_rate was edited",
+    "spec in the manifest": "manifest.json: spec.reasoning was edited",
+    "versions in the manifest": "manifest.json: versions.numpy was edited",
+    "logged metrics": "metrics.jsonl, record 2: logged metrics edited",
+    "an evaluation": "evaluations.jsonl, record 1: logged metrics edited",
+    "a trajectory file deleted": "trajectories/000000.jsonl is missing",
+    "a trajectory file added": "trajectories/000900.jsonl: no receipt names it",
+    "bytes that read the same": "trajectories/000001.jsonl or its digest .*; its records read as before",
+}
 
 
-def edit(path: Path, change: Edit) -> None:
-    records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    change(records)
-    path.write_text("".join(json.dumps(r) + "\n" for r in records), encoding="utf-8")
-
-
-def _set(record: dict[str, Any], *keys: Any, value: Any) -> None:
-    for key in keys[:-1]:
-        record = record[key]
-    assert record[keys[-1]] != value
-    record[keys[-1]] = value
-
-
-UPDATES = "updates.jsonl"
-EPISODES = "trajectories/000000.jsonl"
-
-
-@pytest.mark.parametrize(
-    ("file", "change", "finding"),
-    [
-        (UPDATES, lambda r: _set(r[0], "rows", 0, "advantage", value=9.0), "advantage"),
-        (UPDATES, lambda r: _set(r[0], "rows", 0, "digest", value="0" * 16), "not what its episodes give"),
-        (UPDATES, lambda r: _set(r[0], "rows", 0, "trained", value=10_000), "has trained"),
-        (UPDATES, lambda r: r[0]["rows"].pop(), "not what its episodes give"),
-        (UPDATES, lambda r: r[0]["rows"].append(r[0]["rows"][0]), "not what its episodes give"),
-        (UPDATES, lambda r: _set(r[0], "rows", 0, "episode", value=99), "does not exist"),
-        (UPDATES, lambda r: _set(r[0], "denominator", value=1), "denominator 1, but"),
-        (UPDATES, lambda r: _set(r[0], "returns", 0, value=1e3), "receipt says 1000"),
-        (EPISODES, lambda r: r.pop(), "no whole groups"),
-        (EPISODES, lambda r: r.reverse(), "not those of the receipt"),
-        (EPISODES, lambda r: _set(r[0], "policy", value="step-7"), "not played by policy step-0"),
-        (EPISODES, lambda r: _set(r[0], "status", value="failed"), "could not be scored"),
-    ],
-)
-def test_tampering_is_a_violation(
-    copy: Path, file: str, change: Edit, finding: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    edit(copy / file, change)
+@pytest.mark.parametrize("kind", [*KINDS, *FILE_KINDS])
+def test_every_kind_of_edit_is_noticed_and_named(copy: Path, kind: str) -> None:
+    apply(copy, kind)
     found = violations(copy)
-    assert any(finding in v for v in found), found
+    assert any(re.search(NAMED[kind], v) for v in found), found
+
+
+def test_an_edit_is_told_of_its_update_alone(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    apply(copy, "sampled token")
     assert main(["audit", str(copy)]) == 1
     out = capsys.readouterr().out
     assert "VIOLATION" in out and "violation" in out.splitlines()[-1]
-    assert main(["audit", str(copy), "--step", "1"]) == 0  # the other update is untouched
+    assert main(["audit", str(copy), "--step", "0"]) == 0
+    assert main(["audit", str(copy), "--step", "1"]) == 1
+    assert main(["audit", str(copy), "--step", "2"]) == 0
 
 
-def test_a_resampled_token_is_a_violation(copy: Path) -> None:
-    def change(records: list[dict[str, Any]]) -> None:
-        tokens = records[0]["calls"][0]["completions"][0]["token_ids"]
-        tokens[0] += 1
+def test_an_editor_who_computes_every_digest_anew_is_told_by_the_head_alone(copy: Path) -> None:
+    """What the docs say cannot be noticed without the head, and is with it."""
+    head = file_digest(copy / "seal.json")
+    path = copy / "trajectories" / "000001.jsonl"
 
-    edit(copy / EPISODES, change)
-    assert any("not what its episodes give" in v for v in violations(copy))
+    def colder(records: list[dict[str, Any]]) -> None:
+        records[0]["steps"][0]["text"] = "The price was different."
+
+    edit(path, colder)
+
+    def rechain(records: list[dict[str, Any]]) -> None:
+        stated = records[1]["chain"]["files"]["trajectories/000001.jsonl"]
+        stated["digest"] = file_digest(path)
+        stated["episodes"] = [contents(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+        line = json.dumps(records[1], sort_keys=True, ensure_ascii=False) + "\n"
+        records[2]["chain"]["previous"] = digest(line)
+
+    edit(copy / "updates.jsonl", rechain)
+    assert violations(copy) != []  # the seal is still that of the honest run
+    forged = RunLog(copy).seal()
+    assert violations(copy) == [] and violations(copy, head=forged) == []
+    assert any(f"not {head}" in v for v in violations(copy, head=head))
 
 
-def test_a_lifted_constraint_is_a_violation(copy: Path) -> None:
-    """Forced tokens that are declared free would be trained: the mask changes."""
-
-    def change(records: list[dict[str, Any]]) -> None:
-        completion = records[0]["calls"][0]["completions"][0]
-        assert any(a is not None and len(a) == 1 for a in completion["allowed"])
-        completion["allowed"] = []
-
-    edit(copy / EPISODES, change)
-    assert any("not what its episodes give" in v for v in violations(copy))
+def test_a_missing_seal_is_a_note_and_with_a_head_a_violation(copy: Path) -> None:
+    head = file_digest(copy / "seal.json")
+    (copy / "seal.json").unlink()
+    findings = list(audit(copy))
+    assert [r.violations for r in findings] == [[], [], []] and "cut short" in findings[-1].notes[0]
+    assert any("seal.json is missing" in v for v in violations(copy, head=head))
 
 
-def test_a_changed_balance_is_a_violation(copy: Path) -> None:
-    """The returns, and with them the advantages, are computed again from what the environment reported."""
-
-    def change(records: list[dict[str, Any]]) -> None:
-        records[2]["steps"][-1]["info"]["balance"] += 5
-
-    edit(copy / EPISODES, change)
+def test_updates_deleted_together_with_the_seal_leave_traces(copy: Path) -> None:
+    (copy / "seal.json").unlink()
+    edit(copy / "updates.jsonl", lambda r: r.__delitem__(slice(1, None)))
     found = violations(copy)
-    assert any("but the receipt says" in v for v in found) and any("not what its episodes give" in v for v in found)
+    assert any("metrics.jsonl is of step 3, but the receipts end at step 1" in v for v in found), found
+    edit(copy / "updates.jsonl", lambda r: r.clear())
+    assert any("metrics.jsonl is of step 3, but the receipts end at step 0" in v for v in violations(copy))
 
 
-def test_missing_episodes_are_a_violation(copy: Path) -> None:
-    (copy / EPISODES).unlink()
-    assert any("missing" in v for v in violations(copy))
+# --- what tokens and advantages must be ------------------------------------------------------------------------------
 
 
 def test_a_trained_token_must_be_a_choice_of_the_call_that_claims_it() -> None:
     trajectory = episode([call(0, [1, 2], [5, 7, 9], allowed=((5, 6), (7,), None))])
     (sequence,) = build_sequences(trajectory)
     assert sequence.mask == [0, 0, 1, 0, 1]
-    honest = Receipt(0)
-    _check_tokens(sequence, trajectory, honest)
-    assert honest.violations == [] and honest.by_tag == {"reasoning.direct/act": 2}
+    assert check_tokens(sequence, trajectory) == ([], {"reasoning.direct/act": 2})
 
     def findings(**changes: Any) -> str:
         (changed,) = build_sequences(trajectory)
         for name, (position, value) in changes.items():
             getattr(changed, name)[position] = value
-        receipt = Receipt(0)
-        _check_tokens(changed, trajectory, receipt)
-        return "; ".join(receipt.violations)
+        return "; ".join(check_tokens(changed, trajectory)[0])
 
     assert "no completion of call 0" in findings(tokens=(4, 8))
     assert "not the prompt" in findings(tokens=(0, 3))
     assert "no call sampled" in findings(mask=(1, 1))
     assert "constraint forced" in findings(mask=(3, 1))
+    assert "has no call 9" in findings(calls=(4, 9))
+
+
+def test_what_no_completion_can_be() -> None:
+    def problems(**changes: Any) -> str:
+        given: dict[str, Any] = {"logprobs": [-0.5, 0.0, -1.0], "allowed": ((5, 6), (7,), None), **changes}
+        (completion,) = call(0, [1], [5, 7, 9], **given).completions
+        return "; ".join(check_completion(completion, "here"))
+
+    assert problems() == ""
+    assert problems(allowed=()) == ""
+    assert "does not hold token 0" in problems(allowed=((6, 8), (7,), None))
+    assert "token 1 was forced" in problems(logprobs=[-0.5, -3.0, -1.0])
+    assert "above 0" in problems(logprobs=[0.5, 0.0, -1.0])
+    assert "not finite" in problems(logprobs=[float("nan"), 0.0, -1.0])
+    assert "3 tokens, 2 log-probabilities" in problems(logprobs=[-0.5, 0.0])
+
+
+@pytest.mark.parametrize(("estimator", "told"), [("grpo", True), ("gigpo", False)])
+def test_advantages_sum_to_zero_where_the_estimator_says_so(estimator: str, told: bool) -> None:
+    """Two rollouts with advantages 1 and -0.5: the sum is 0.5."""
+    episodes = [episode([call(0, [1], [5])]) for _ in range(2)]
+    rows = [Row(build_sequences(t)[0], a, i) for i, (t, a) in enumerate(zip(episodes, (1.0, -0.5), strict=True))]
+    finding = UpdateAudit(0)
+    _check_advantages(finding, rows, episodes, CreditRule(2, estimator=estimator))
+    assert bool(finding.violations) is told
+    assert not told or "advantages of group 0 sum to 0.5, not 0" in finding.violations[0]
+
+
+def test_large_returns_are_not_called_a_violation_for_their_rounding() -> None:
+    """Advantages of +-1e9 that differ in their last digit sum to 1e-7, which is nothing beside them."""
+    episodes = [episode([call(0, [1], [5])]) for _ in range(2)]
+    rows = [Row(build_sequences(t)[0], a, i) for i, (t, a) in enumerate(zip(episodes, (1e9, -1e9 + 1e-7), strict=True))]
+    finding = UpdateAudit(0)
+    _check_advantages(finding, rows, episodes, CreditRule(2, estimator="centred"))
+    _check_samples(finding, rows, episodes)
+    assert finding.violations == []
+
+
+def test_padding_rows_are_those_of_equal_micro_batches() -> None:
+    sequence = build_sequences(episode([call(0, [1], [5])]))[0]
+
+    def padding(episodes: list[int], of: int, ranks: int, micro_batches: int) -> int:
+        return padding_rows([Row(sequence, 1.0, e) for e in episodes], of, ranks, micro_batches)
+
+    assert padding([0, 1, 2, 3], 4, 1, 2) == 0  # 2 + 2
+    assert padding([0, 0, 1, 2, 3], 4, 1, 2) == 1  # 3 + 2
+    assert padding([], 4, 1, 2) == 2  # one row each, none of them real
+    # Two ranks with two episodes each: 3 rows and 1 row into 2 micro-batches of 2 on both.
+    assert padding([0, 0, 1, 3], 4, 2, 2) == 4
 
 
 def test_the_digest_reads_tokens_mask_and_advantage() -> None:
-    digest = row_digest([1, 2], [0, 1], 0.5)
-    assert len(digest) == 16
+    known = row_digest([1, 2], [0, 1], 0.5)
     others = [row_digest([1, 3], [0, 1], 0.5), row_digest([1, 2], [1, 1], 0.5), row_digest([1, 2], [0, 1], -0.5)]
-    assert digest not in others and len(set(others)) == 3
+    assert known not in others and len(set(others)) == 3
     # Seven digits: what differs in float noise only is equal.
-    assert digest == row_digest([1, 2], [0, 1], 0.5 + 1e-12)
+    assert known == row_digest([1, 2], [0, 1], 0.5 + 1e-12)
+
+
+def test_every_field_of_an_episode_has_one_class() -> None:
+    record = json.loads(episode([call(0, [1], [5])], rewards=(1.0,)).to_json())
+    before = contents(record)
+    assert "other fields" not in before
+    assert differing(before, contents({**record, "new": 1})) == ["other fields"]
+    record["calls"][0]["completions"][0]["later"] = 1
+    assert differing(before, contents(record)) == ["other fields"]
+    assert differing(None, before) == sorted(before)
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------
@@ -231,26 +340,38 @@ def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path, capsys: pytest.Ca
         return err
 
     assert "holds no training run" in refused(str(tmp_path / "nowhere"))
-    assert "has no update 9; it has [0, 1]" in refused(str(copy), "--step", "9")
-    with open(copy / UPDATES, "r+", encoding="utf-8") as file:
+    assert "has no update 9; it has [0, 1, 2]" in refused(str(copy), "--step", "9")
+    with open(copy / "updates.jsonl", "r+", encoding="utf-8") as file:
         file.write("{broken")
     assert "updates.jsonl, line 1: not JSON" in refused(str(copy))
     (copy / "manifest.json").write_text("[]")
     assert "manifest" in refused(str(copy))
+    (copy / "manifest.json").unlink()
+    assert "its manifest.json was removed" in refused(str(copy))
+
+
+def test_a_receipt_of_another_version_is_told(copy: Path) -> None:
+    edit(copy / "updates.jsonl", lambda r: [record.pop("chain") and record.pop("format") for record in r] and None)
+    assert any("has format None, expected 2" in v for v in violations(copy))
 
 
 def test_a_line_that_is_being_written_is_left_alone(copy: Path) -> None:
     """The audit of a live run reads whole lines only and changes nothing."""
-    with open(copy / UPDATES, "a", encoding="utf-8") as file:
-        file.write('{"round": 2, "epi')
-    before = (copy / UPDATES).read_bytes()
-    assert [r.round for r in audit(copy)] == [0, 1]
-    assert (copy / UPDATES).read_bytes() == before
-    RunLog(copy).append(UPDATES, {"round": 2})
-    assert [r["round"] for r in RunLog(copy).read(UPDATES)] == [0, 1, 2]
+    with open(copy / "updates.jsonl", "a", encoding="utf-8") as file:
+        file.write('{"round": 3, "epi')
+    before = (copy / "updates.jsonl").read_bytes()
+    assert [r.round for r in audit(copy)] == [0, 1, 2]
+    assert (copy / "updates.jsonl").read_bytes() == before
+    RunLog(copy).receipt({"round": 3}, {})
+    assert [r["round"] for r in RunLog(copy).read("updates.jsonl")] == [0, 1, 2, 3]
 
 
 def test_a_run_without_updates_is_refused(tmp_path: Path) -> None:
     RunLog(tmp_path).manifest(config={})
     with pytest.raises(SpecError, match="holds no training run"):
         list(audit(tmp_path))
+
+
+def test_the_audit_needs_no_torch() -> None:
+    script = "import sys; sys.modules['torch'] = None; import trainers.audit, agentspec.cli.audit"
+    subprocess.run([sys.executable, "-c", script], check=True)

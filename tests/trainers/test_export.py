@@ -101,7 +101,8 @@ def test_the_last_complete_checkpoint_stands_in_for_the_final_model(tmp_path: Pa
     for step in (2, 10, 12):
         write_run(run, model, base, folder=f"checkpoint-{step}")
         if step != 12:  # the trainer's state is written last: this one was cut short
-            (run / f"checkpoint-{step}" / "trainer_state.json").write_text("{}")
+            for name in ("trainer_state.json", "scaffold_state.json"):
+                (run / f"checkpoint-{step}" / name).write_text("{}")
     assert find_trained(run).folder.name == "checkpoint-10"  # not "checkpoint-2", which sorts last as text
     manifest = json.loads((export(run, tmp_path / "out") / MANIFEST).read_text())
     assert manifest["source"] == "checkpoint-10"

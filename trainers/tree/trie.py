@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from agentspec.tokens import shared_prefix
 from trainers.tree.flex import block_mask, subtree_ends
 
 NODE_TOKENS = 512
@@ -77,7 +78,7 @@ def build_tree(sequences: Sequence[Sequence[int]], node_tokens: int = NODE_TOKEN
             continue
         first, last = sequences[group[0]], sequences[group[-1]]
         # The group is sorted: what its first and last have in common, all have. One may end before the others.
-        end = _common(first, last, depth, min(depth + node_tokens, *(len(sequences[i]) for i in group)))
+        end = shared_prefix(first, last, depth, min(depth + node_tokens, *(len(sequences[i]) for i in group)))
         start = len(tree.tokens)
         tree.tokens += first[depth:end]
         tree.positions += range(depth, end)
@@ -97,8 +98,3 @@ def _split(group: list[int], sequences: Sequence[Sequence[int]], depth: int) -> 
         else:
             runs.append([i])
     return runs
-
-
-def _common(a: Sequence[int], b: Sequence[int], start: int, stop: int) -> int:
-    """First position from ``start`` on at which ``a`` and ``b`` differ, at most ``stop``."""
-    return next((p for p in range(start, stop) if a[p] != b[p]), stop)

@@ -1,0 +1,77 @@
+"""Where each token of a row comes from: proof that what is trained was sampled, there, after exactly that prompt."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+
+from agentspec.trajectory import Trajectory
+from agentspec.types import Completion, LLMCall
+from trainers.sequences import TokenSequence
+
+
+def check_tokens(sequence: TokenSequence, trajectory: Trajectory) -> tuple[list[str], Counter[str]]:
+    """What is wrong with a row, and its trained tokens by `module/purpose`.
+
+    Every trained token must be a token of a completion of the call that claims it, after exactly the prompt that the
+    call had, chosen among what its constraint left, and not forced.
+    """
+    calls = {c.id: c for c in trajectory.calls}
+    problems: list[str] = []
+    by_tag: Counter[str] = Counter()
+    for start, end in _runs(sequence):
+        owner, trained = sequence.calls[start], sum(sequence.mask[start:end])
+        if owner < 0:
+            if trained:
+                problems.append(f"{trained} tokens that no call sampled are trained in {trajectory.episode}")
+        elif owner not in calls:
+            problems.append(f"{trajectory.episode} has no call {owner}, which is said to have sampled tokens")
+        else:
+            problems += _check_run(sequence, start, end, calls[owner], trajectory.episode)
+            by_tag[calls[owner].tag.path] += trained
+    return problems, by_tag
+
+
+def _runs(sequence: TokenSequence) -> Iterator[tuple[int, int]]:
+    """Maximal stretches of one owner."""
+    start = 0
+    for end in range(1, len(sequence) + 1):
+        if end == len(sequence) or sequence.calls[end] != sequence.calls[start]:
+            yield start, end
+            start = end
+
+
+def _check_run(sequence: TokenSequence, start: int, end: int, call: LLMCall, episode: str) -> Iterator[str]:
+    where = f"call {call.id} of {episode}"
+    tokens = tuple(sequence.tokens[start:end])
+    matching = [c for c in call.completions if c.token_ids == tokens]
+    if not matching:
+        yield f"tokens {start}..{end} are no completion of {where}"
+        return
+    if tuple(sequence.tokens[:start]) != call.prompt_ids:
+        yield f"the tokens before position {start} are not the prompt of {where}"
+    forced = [i for i, a in enumerate(matching[0].allowed) if a is not None and len(a) == 1]
+    if any(sequence.mask[start + i] for i in forced):
+        yield f"{where} trains tokens that its constraint forced"
+
+
+def check_completion(completion: Completion, where: str) -> Iterator[str]:
+    """What cannot be true of a recorded completion, whoever wrote it.
+
+    Constraints must have left the token that was sampled; a log-probability is a number of at most 0, and that of a
+    forced token is 0.
+    """
+    ids, logprobs, allowed = completion.token_ids, completion.logprobs, completion.allowed
+    if (logprobs and len(logprobs) != len(ids)) or (allowed and len(allowed) != len(ids)):
+        yield f"{where} has {len(ids)} tokens, {len(logprobs)} log-probabilities and {len(allowed)} constraints"
+        return
+    if any(not math.isfinite(p) or p > 1e-5 for p in logprobs):
+        yield f"{where} has log-probabilities that are none (above 0, or not finite)"
+    for position, choice in enumerate(allowed):
+        if choice is None:
+            continue
+        if ids[position] not in choice:
+            yield f"{where}: its constraint does not hold token {position}, which was sampled"
+        if len(choice) == 1 and logprobs and abs(logprobs[position]) > 1e-5:
+            yield f"{where}: token {position} was forced, and its log-probability is not 0"

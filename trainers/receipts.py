@@ -1,0 +1,134 @@
+"""The receipt of a generation round: what the update used, and of whom it says that it used it.
+
+The trainer writes one from what it holds in memory, the audit makes the same from the recorded episodes and compares
+them field by field. A receipt names the round's episodes with their returns; every row with its advantage and digests
+of what the loss read; the loss denominator; the number of padding rows; the settings of credit and loss.
+Equal updates have equal receipts, but for the `chain`: it holds digests of records in which times stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from agentspec.files import jsonable
+from trainers.contents import short_digest
+from trainers.credit import FIELDS, Gather
+from trainers.runlog import FORMAT, RunLog
+from trainers.sequences import Row
+
+LOSS_SETTINGS = (
+    "loss_type",
+    "epsilon",
+    "epsilon_high",
+    "delta",
+    "beta",
+    "num_iterations",
+    "steps_per_generation",
+    "gradient_accumulation_steps",
+    "learning_rate",
+    "lr_scheduler_type",
+    "warmup_steps",
+    "max_grad_norm",
+    "seed",
+)
+"""Fields of a configuration that an update depends on beside those of credit."""
+
+
+def settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What an update depends on, of a configuration as plain data."""
+    return {name: jsonable(config[name]) for name in (*FIELDS, *LOSS_SETTINGS) if name in config}
+
+
+def row_digest(tokens: Sequence[int], mask: Sequence[int], advantage: float | Sequence[float]) -> str:
+    """12 hex digits over what a row is and earns: tokens, mask and advantages, these to seven digits."""
+    values = [advantage] if isinstance(advantage, (int, float)) else list(advantage)
+    return short_digest([list(tokens), list(mask), [f"{v:.6e}" for v in values]])
+
+
+def sampling_digest(row: Row) -> str:
+    """12 hex digits over the distributions that a row's tokens were sampled from."""
+    s = row.sequence
+    return short_digest([s.logprobs, s.temperatures, [[p, list(ids)] for p, ids in sorted(s.allowed.items())]])
+
+
+def receipt_rows(rows: Sequence[Row], first: int = 0) -> list[dict[str, Any]]:
+    """What a receipt says of each row; `first` is the place of this rank's first episode among those of all ranks."""
+    return [
+        {
+            "episode": first + r.episode,
+            "tokens": len(r.sequence),
+            "trained": r.sequence.trained,
+            "advantage": r.advantage,
+            "digest": row_digest(r.sequence.tokens, r.sequence.mask, r.advantage),
+            "sampling": sampling_digest(r),
+        }
+        for r in rows
+    ]
+
+
+def receipt_record(
+    *,
+    round: int,
+    played: Sequence[tuple[str, float | None]],
+    rows: Sequence[Mapping[str, Any]],
+    padding_rows: int,
+    denominator: int,
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """A receipt but for its chain.
+
+    Args:
+        round: number of the generation round: optimiser steps before it.
+        played: id and return of every episode of the round.
+        rows: of all ranks, as of `receipt_rows`.
+        padding_rows: rows that fill up micro-batches and train nothing.
+        denominator: trained tokens that the loss is divided by.
+        settings: as of `settings`.
+    """
+    return {
+        "format": FORMAT,
+        "round": round,
+        "episodes": [name for name, _ in played],
+        "returns": [value for _, value in played],
+        "rows": list(rows),
+        "padding_rows": padding_rows,
+        "denominator": denominator,
+        "settings": dict(settings),
+    }
+
+
+def write_receipt(
+    log: RunLog,
+    gather: Gather,
+    *,
+    main: bool,
+    rank: int,
+    round: int,
+    played: Sequence[tuple[str, float | None]],
+    rows: Sequence[Row],
+    padding_rows: int,
+    denominator: int,
+    config: Mapping[str, Any],
+) -> None:
+    """Gather what every rank contributed to a round; the main process appends the receipt.
+
+    Args:
+        gather: list of this rank -> concatenated lists of all ranks.
+        played: id and return of this rank's episodes.
+        rows: of this rank.
+        padding_rows: of this rank.
+        config: the run's configuration as plain data.
+    """
+    files, everyone = dict(gather(list(log.written().items()))), gather(list(played))
+    all_rows, padding = gather(receipt_rows(rows, rank * len(played))), sum(gather([padding_rows]))
+    if main:
+        record = receipt_record(
+            round=round,
+            played=everyone,
+            rows=all_rows,
+            padding_rows=padding,
+            denominator=denominator,
+            settings=settings(config),
+        )
+        log.receipt(record, files)
