@@ -1,20 +1,20 @@
-"""Continuous batching: episodes whose answers differ in length, with each way of batching.
+"""Continuous and closed batches: episodes whose answers differ in length.
 
     python -m benchmarks.batching [--json] [--rollouts 8] [--turns 6] [--shortest 4] [--longest 64] [--repeats 3]
 
-The same episodes (:mod:`benchmarks.market`) are played from an empty cache with a closed batch, and with both
-continuous ones (see :mod:`agentspec.llm.batching`). Every answer has its own number of tokens, drawn evenly from
-``--shortest ... --longest`` by the seed of its request, with nothing that ends it early: the work is the same however
-it is batched. Modes take turns in one process; reported are median seconds, forwards of the model (which do not depend
-on the machine), and ``ratio``, the closed batch's seconds over the others'.
+The same episodes (`benchmarks.market`) are played from an empty cache with closed batches and with a continuous one
+(see `agentspec.llm.batching`). Every answer has its own number of tokens, drawn evenly from `--shortest ... --longest`
+by the seed of its request, with nothing that ends it early: the work is the same however it is batched. Modes take
+turns in one process; reported are median seconds, forwards of the model (which do not depend on the machine), and
+`ratio`, the closed batch's seconds over the others'.
 
-``same_answers`` is the share of answers that are, token by token, those of closed batches, and ``same_bits`` says that
-all repeats agree to the last bit of all log-probabilities. Both are promised where arithmetic is batch-invariant
-(float32 on a CPU with MKL). Elsewhere which rows share a forward changes the rounding of its logits, that moves the
-border between two of the many improbable tokens, and now and then one is drawn there; from then on the episode differs,
-and ``eager``, where timing decides who shares a forward, does not repeat. The second part, ``slow_env``, is the same
-with environments that take ``--delay`` seconds a call and a tiny random model: there the model should not wait for the
-environments.
+`same_answers` is the share of answers that are, token by token, those of closed batches, and `same_bits` says that all
+repeats agree to the last bit of all log-probabilities. `invariant` says whether the model's arithmetic was found to be
+batch-invariant (float32 on a CPU), which promises both. Elsewhere which rows share a forward changes the rounding of
+its logits, that moves the border between two of the many improbable tokens, and now and then one is drawn there; from
+then on the episode differs, and a continuous batch, where timing decides who shares a forward, does not repeat. The
+second part, `slow_env`, is the same with environments that take `--delay` seconds a call and a tiny random model:
+there the model should not wait for the environments.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from typing import Any, get_args
 
 from agentspec.llm.batching import Batching
 from agentspec.llm.local import LocalLLM
+from agentspec.llm.local.forward import PackedModel
 from benchmarks.rollouts import agent_spec, load_model, market_tasks, tiny
 
 
@@ -130,17 +131,19 @@ def main() -> None:
     options = parser.parse_args()
     model, tokenizer = tiny() if options.model == "tiny" else load_model(options.model)
     world: dict[str, Any] = {"steps": options.turns, "words": options.words}
-    results = {"batching": compare(model, tokenizer, world, options)}
+    results: dict[str, Any] = {"invariant": PackedModel(model.eval()).invariant()}
+    results["batching"] = compare(model, tokenizer, world, options)
     if options.delay:
         slow = {"steps": options.turns, "words": 2, "delay_s": options.delay}
         results["slow_env"] = compare(*tiny(), slow, options)
     if options.json:
         print(json.dumps(results))
         return
+    print(f"batch-invariant: {results.pop('invariant')}")
     for part, modes in results.items():
         for mode, r in modes.items():
             print(
-                f"{part:<9} {mode:<8} {r['seconds']:7.2f} s  {r['ratio']:5.2f}x  {r['forwards']:5} forwards  "
+                f"{part:<9} {mode:<10} {r['seconds']:7.2f} s  {r['ratio']:5.2f}x  {r['forwards']:5} forwards  "
                 f"{r['tokens']} tokens  same answers {r['same_answers']:.0%}, same bits {r['same_bits']}"
             )
 

@@ -35,7 +35,7 @@ from agentspec.envs.deliverybench.city.citymap import forget_cities
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe
-from agentspec.envs.deliverybench.view.observation import around, full_text
+from agentspec.envs.deliverybench.view.full import around, full_text
 from agentspec.envs.deliverybench.world.engine import World
 
 REFERENCE_MAPS = Path(__file__).resolve().parents[1] / ".." / "shared" / "deliverybench" / "maps"
@@ -45,6 +45,7 @@ STEPS = 4000
 """Steps for the figures of many environments in one process."""
 ORIGINAL_ACTIONS_PER_S = (21.0, 33.0)
 ORIGINAL_TEXT_S = (0.3, 0.9)
+ENVIRONMENTS = 64
 GOALS = {"steps_per_s": 10_000, "steps_per_s_full_text": 2_000, "steps_per_s_menu": 5_000}
 LIMITS_MS = {"warm_reset_ms": 2.0, "snapshot_ms": 1.0, "restore_ms": 1.0}
 
@@ -155,15 +156,15 @@ def snapshots(folder: Path, actions: Sequence[str]) -> dict[str, float]:
     }
 
 
-def memory(folder: Path, shifts: Shifts, count: int = 64) -> float:
-    """Bytes of one environment in the middle of a shift, the shared city left out: the mean of ``count``."""
+def memory(folder: Path, shifts: Shifts) -> float:
+    """Bytes of one environment in the middle of a shift, the shared city left out: the mean of `ENVIRONMENTS`."""
     city_env = DeliveryBenchEnv(map=folder)
     env_pass(city_env, shifts)
     gc.collect()
     tracemalloc.start()
     before = tracemalloc.get_traced_memory()[0]
     envs = []
-    for i in range(count):
+    for i in range(ENVIRONMENTS):
         env = DeliveryBenchEnv(map=folder)
         env.reset(seed=i % len(shifts))
         for action in shifts[i % len(shifts)][: len(shifts[i % len(shifts)]) // 2]:

@@ -68,8 +68,8 @@ def make_batch(model: Any, seed: int) -> list[Rollout]:
     ]
     batch = []
     for g, r in product(range(GROUPS), range(GROUP)):
-        turns = _turns(rng, len(rewards[g][r]), chains=1 + (g + r) % 3)
-        turns = [_recorded(model, turn, rng) for turn in turns]
+        drawn = _turns(rng, len(rewards[g][r]), chains=1 + (g + r) % 3)
+        turns = [_recorded(model, turn, rng) for turn in drawn]
         states = [f"{g} {min(t, 1)}" for t in range(len(rewards[g][r]))]
         batch.append(Rollout(rewards[g][r], states, turns, failed=(g, r) == (1, 3), overlong=(g, r) == (2, 1)))
     return batch
@@ -81,7 +81,7 @@ def _turns(rng: random.Random, steps: int, chains: int) -> list[Turn]:
     def draw(low: int, high: int) -> list[int]:
         return [rng.randrange(10, 60) for _ in range(rng.randint(low, high))]
 
-    turns = []
+    turns: list[Turn] = []
     for chain in range(chains):
         prompt = [chain, *draw(2, 5)]
         for _ in range(2):
@@ -227,10 +227,9 @@ def oracle_loss(tokens: Sequence[Token], config: dict[str, Any], rollouts: int) 
             value = value + beta * weight * (torch.exp(gap) - gap - 1)
         losses.append(value)
     if name == "grpo":
-        means = []
+        means: list[torch.Tensor] = []
         for row in rows:
-            own = [v for v, t in zip(losses, tokens, strict=True) if t.row == row]
-            means.append(torch.stack(own).mean())
+            means.append(torch.stack([v for v, t in zip(losses, tokens, strict=True) if t.row == row]).mean())
         return torch.stack(means).mean()
     return torch.stack(losses).sum() / (rollouts * LENGTH if name == "dr_grpo" else len(tokens))
 
@@ -322,10 +321,7 @@ def trainer_gradients(model: Any, batch: Sequence[Rollout], config: dict[str, An
             save_strategy="no",
             disable_tqdm=True,
             shuffle_dataset=False,
-            **({"max_completion_length": LENGTH} if config["loss_type"] == "dr_grpo" else {}),
-            **({"gamma": GAMMA} if config["estimator"] in ("reward_to_go", "gigpo") else {}),
-            **({"gigpo_weight": WEIGHT} if config["estimator"] == "gigpo" else {}),
-            **config,
+            **(read_by(config) | config),
         )
         settings.logging_strategy = "no"
         trainer = ScaffoldGRPOTrainer(
@@ -333,12 +329,19 @@ def trainer_gradients(model: Any, batch: Sequence[Rollout], config: dict[str, An
             settings,
             train_dataset=Dataset.from_list(task_rows([Task("toy", i) for i in range(GROUPS)])),
             processing_class=tiny_tokenizer(),
-            make_llm=lambda *_: _NoModel(),  # type: ignore[arg-type, return-value]  # nobody asks it
+            make_llm=lambda *_: _NoModel(),  # type: ignore[arg-type]  # nobody asks it
             callbacks=[Keep()],
         )
         with contextlib.redirect_stdout(io.StringIO()):  # the summary that transformers prints
             trainer.train()
     return found
+
+
+def read_by(config: dict[str, Any]) -> dict[str, Any]:
+    """Settings that only this loss and estimator read."""
+    length = {"max_completion_length": LENGTH} if config["loss_type"] == "dr_grpo" else {}
+    discount = {"gamma": GAMMA} if config["estimator"] in ("reward_to_go", "gigpo") else {}
+    return length | discount | ({"gigpo_weight": WEIGHT} if config["estimator"] == "gigpo" else {})
 
 
 class _NoModel:

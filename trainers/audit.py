@@ -9,7 +9,7 @@ compared field by field, so that
 - masks cover model tokens only, and none that a constraint forced;
 - the advantage of every row is what the declared estimator gives for the returns, and those of a group sum to zero
   where the estimator says so;
-- the loss denominator is the number of trained tokens; padding rows train nothing; rollouts that could not be scored
+- the loss denominator is what the loss divides by (:mod:`trainers.losses`); padding rows train nothing; rollouts that could not be scored
   have no rows; the settings of the loss are those of the manifest.
 """
 
@@ -27,6 +27,7 @@ from agentspec.trajectory import Trajectory
 from trainers.chain import Manifests, check_end, files_of, linked_receipts, read_round
 from trainers.credit import CreditRule
 from trainers.estimators import estimator
+from trainers.losses import UpdateSize, loss
 from trainers.provenance import check_completion, check_tokens
 from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.run_folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
@@ -60,7 +61,7 @@ class UpdateAudit:
         head = (
             f"update {self.round}: {self.episodes} episodes ({self.unscorable} unscorable) -> {self.rows} rows "
             f"({self.zero_gradient_rows} without gradient, {self.padding_rows} padding), {self.tokens} tokens, "
-            f"{self.trained} trained = denominator {self.denominator}; trained by call: {tags}"
+            f"{self.trained} trained, denominator {self.denominator}; trained by call: {tags}"
         )
         return [head, *(f"  VIOLATION {v}" for v in self.violations), *(f"  note: {n}" for n in self.notes)]
 
@@ -152,12 +153,13 @@ def _check_update(
     finding.zero_gradient_rows = sum(r.zero_gradient for r in rows)
     finding.tokens = sum(len(r.sequence) for r in rows)
     finding.trained = sum(r.sequence.trained for r in rows)
+    size = UpdateSize(finding.trained, len(episodes), config["max_completion_length"])
     again = receipt_record(
         round=finding.round,
         played=[(e.trajectory.episode, e.total) for e in scored],
         rows=receipt_rows(rows),
         padding_rows=padding_rows(rows, len(episodes), _ranks(record), config["steps_per_generation"]),
-        denominator=finding.trained,
+        denominator=loss(config["loss_type"]).denominator(size),
         settings=settings(config),
     )
     given = {name: value for name, value in record.items() if name != "chain"}

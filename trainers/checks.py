@@ -214,6 +214,8 @@ def check_validation(config: ScaffoldConfig) -> None:
 
 def check_vllm(config: ScaffoldConfig) -> None:
     """Nothing that TRL offers for whole rows, or for all ranks at once."""
+    if config.vllm_batch_invariant:
+        _check_batch_invariant(config)
     if not config.use_vllm:
         return
     if config.vllm_mode == "colocate" and config.vllm_tensor_parallel_size != 1:
@@ -226,6 +228,21 @@ def check_vllm(config: ScaffoldConfig) -> None:
         raise SpecError(
             f"vllm_importance_sampling_mode {config.vllm_importance_sampling_mode!r} speaks of rows, and an episode "
             f"may have several; use one of {', '.join(TOKEN_MODES)}"
+        )
+
+
+def _check_batch_invariant(config: ScaffoldConfig) -> None:
+    """`vllm_batch_invariant` can be switched on from here, and vLLM offers it."""
+    if not config.use_vllm:
+        raise SpecError(
+            "vllm_batch_invariant is true without vLLM: it would change nothing; set `use_vllm: true`, or leave it out "
+            "(the local backend tries out by itself whether a device is batch-invariant)"
+        )
+    if config.vllm_mode != "colocate":
+        raise SpecError(
+            f"vllm_batch_invariant is true with vllm_mode {config.vllm_mode}: a server's arithmetic is set where it is "
+            "started, and cannot be seen from here; start it as `VLLM_BATCH_INVARIANT=1 vllm serve ...` and leave the "
+            "field out"
         )
 
 

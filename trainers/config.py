@@ -59,8 +59,9 @@ class ScaffoldConfig(GRPOConfig):
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: ``ordered`` and ``closed`` repeat to the
-            last bit, ``eager`` waits for nobody, ``auto`` does so where it repeats (:mod:`agentspec.llm.batching`).
+        batching: when the local backend takes requests into a running batch: ``continuous`` at any time, ``closed``
+            never, so that runs repeat on every device; ``auto`` is ``continuous`` where that repeats to the last bit
+            (a CPU in float32), else ``closed``, with a warning (`agentspec.llm.batching`).
         packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
@@ -71,6 +72,8 @@ class ScaffoldConfig(GRPOConfig):
         vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
             trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
             (``token_mask``); both need ``vllm_importance_sampling_correction``.
+        vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
+            runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
         validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
@@ -105,7 +108,7 @@ class ScaffoldConfig(GRPOConfig):
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    batching: str = field(default="auto", metadata={"help": "auto, ordered, closed or eager"})
+    batching: str = field(default="auto", metadata={"help": "auto, continuous or closed"})
     packing: str = field(default="tree", metadata={"help": "tree or padded"})
     tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
     lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
@@ -116,6 +119,7 @@ class ScaffoldConfig(GRPOConfig):
     vllm_importance_sampling_mode: str = field(
         default="token_truncate", metadata={"help": "token_truncate or token_mask"}
     )
+    vllm_batch_invariant: bool = field(default=False, metadata={"help": "vLLM's batch-invariant mode"})
     eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
     eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
     validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})

@@ -17,7 +17,6 @@ import torch
 from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
-from trl.trainer.utils import use_adapter
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
@@ -28,24 +27,24 @@ from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, CreditRule, ScoredEpisode
-from trainers.distributed import KnownLayout, check_trained, is_sharded
-from trainers.finite import FiniteGuard, require_finite, without_dropout
-from trainers.forward import rows_logprobs
-from trainers.losses import UpdateSize, divergence, loss
+from trainers.distributed import KnownLayout, check_trained
+from trainers.finite import FiniteGuard, without_dropout
+from trainers.losses import UpdateSize, loss
 from trainers.micro_batches import ROWS, collate, padding_row, partition
+from trainers.policy_loss import PolicyLoss
 from trainers.receipts import write_receipt
 from trainers.resume import ExactResume, restore_finished
-from trainers.rollouts import collect, rollout_jobs, task_of
-from trainers.round_metrics import episode_metrics, round_metrics
+from trainers.rollouts import collect, local_llm, rollout_jobs, task_of
+from trainers.round_metrics import episode_metrics, named, round_metrics
 from trainers.run_folder import last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
 from trainers.validation import validate, validation_scaffolds
-from trainers.vllm import importance_ratio, vllm_round
+from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -67,10 +66,10 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
         **kwargs: Any,
     ) -> None:
         args.check()
+        prepare_vllm(args)
         self.rewards_used = args.reward_set
         self.credit_rule = CreditRule.from_config(args)
         self._played: list[ScoredEpisode] = []
-        self._current: dict[str, Any] | None = None
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
         super().__init__(
@@ -206,20 +205,6 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
         batch: dict[str, Any] = self._buffered_inputs[self._step % self.args.steps_per_generation]
         return batch
 
-    @property
-    def _steps_per_round(self) -> int:
-        """Micro-batches between two generation rounds."""
-        return int(self.args.steps_per_generation * self.num_iterations)
-
-    @property
-    def _skip_backward(self) -> bool:
-        """Whether rows with advantage 0 have no gradient, and can be computed without a backward pass.
-
-        A divergence from the reference gives them one. Where weights are sharded every rank must run as many forwards
-        as the others.
-        """
-        return self.beta == 0.0 and not is_sharded(self.accelerator)
-
     def _partitioned(self, rows: Sequence[Row]) -> list[list[Row]]:
         """Rows in micro-batches; every rank has as many, of as many rows."""
         count = self.args.steps_per_generation
@@ -248,79 +233,6 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
                 batch["ref_per_token_logps"] = self._reference_logprobs(rows)
             batches.append(batch)
         return batches
-
-    @property
-    def _off_policy(self) -> bool:
-        """Whether an update may see weights other than those that sampled (then the recorded log-probs are the old)."""
-        return bool(self.args.gradient_accumulation_steps % self._steps_per_round != 0)
-
-    def _reference_logprobs(self, rows: Sequence[Row]) -> torch.Tensor:
-        """Log-probabilities under the reference: the policy as training began, or the base under its adapter."""
-        with torch.no_grad():
-            if self.ref_model is not None:
-                return rows_logprobs(self.ref_model, rows, **self._packing)[0]
-            model = self.accelerator.unwrap_model(self.model)
-            initial = self.args.reference == "initial" and "ref" in model.peft_config  # TRL's copy of the adapter
-            with use_adapter(model, adapter_name="ref" if initial else None):
-                return rows_logprobs(model, rows, **self._packing)[0]
-
-    def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
-        self._current = inputs
-        try:
-            compute = self._own_loss if self.loss_spec.objective else super()._compute_loss
-            value: torch.Tensor = compute(model, inputs)
-        finally:
-            self._current = None
-        require_finite("loss", [(self.args.loss_type, value.detach())], self.state.global_step)
-        return value
-
-    def _own_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
-        """As TRL computes its losses, with an objective of :mod:`trainers.losses`."""
-        logps, entropies, _ = self._get_per_token_logps_and_entropies(model)
-        mask, advantages = inputs["tool_mask"], inputs["advantages"]
-        advantages = advantages.unsqueeze(1) if advantages.dim() == 1 else advantages
-        old = inputs.get("old_per_token_logps", logps.detach())
-        limits = {"low": self.epsilon_low, "high": self.epsilon_high}
-        per_token = self.loss_spec.objective(logps, old, advantages, **limits)  # type: ignore[misc]  # it has one
-        clipped = self.loss_spec.clipped(logps.detach(), old, advantages, **limits)
-        figures = {"entropy": entropies, "clip_ratio/region_mean": clipped.float()}
-        if self.top_entropy_quantile < 1.0:
-            per_token = per_token * self.get_high_entropy_mask(entropies, mask, 1 - self.top_entropy_quantile)
-        per_token = per_token * inputs.get("importance_sampling_ratio", 1.0)
-        if self.beta != 0.0:
-            figures["kl"] = divergence(logps, inputs["ref_per_token_logps"])
-            if self.args.use_bias_correction_kl:
-                figures["kl"] = figures["kl"] * (logps - old).exp()
-            per_token = per_token + self.beta * figures["kl"]
-        for name, values in figures.items():
-            sums = torch.stack([(values.detach() * mask).sum(), mask.sum().float()])
-            total, count = self.accelerator.reduce(sums, reduction="sum")
-            self._metrics["train"][name].append((total / count.clamp(min=1.0)).item())
-        # The denominator spans the round; an update is one accumulation window of it, and processes are averaged.
-        share = self.current_gradient_accumulation_steps / self.args.steps_per_generation
-        return (per_token * mask).sum() * self.accelerator.num_processes / (inputs["num_items_in_batch"] * share)
-
-    def _get_per_token_logps_and_entropies(self, model: nn.Module, *_: Any, **__: Any) -> Any:
-        """Log-probabilities of the micro-batch's rows under the distributions they were sampled from."""
-        inputs = self._current
-        assert inputs is not None, "log-probabilities are computed inside a loss"
-        with self.accelerator.autocast():
-            logps, entropies = rows_logprobs(model, inputs[ROWS], skip_backward=self._skip_backward, **self._packing)
-        trained, current = inputs["tool_mask"], logps.detach()
-        if self._step % self._steps_per_round < self.args.gradient_accumulation_steps:  # still those that sampled
-            self._largest_difference.append(((current - inputs["sampled_logprobs"]).abs() * trained).max())
-        old = inputs.get("old_per_token_logps", current)
-        advantages = inputs["advantages"]
-        advantages = advantages.unsqueeze(1) if advantages.dim() == 1 else advantages
-        clipped = self.loss_spec.clipped(current, old, advantages, low=self.epsilon_low, high=self.epsilon_high)
-        self._call_metrics.add(inputs[ROWS], entropies, clipped)
-        if self.use_vllm and self.vllm_importance_sampling_correction:
-            # Where the recorded log-probabilities are the old ones, the ratio starts from what vLLM sampled already.
-            bounds = self.vllm_importance_sampling_clip_min, self.vllm_importance_sampling_clip_max
-            inputs["importance_sampling_ratio"] = importance_ratio(
-                old, inputs["sampled_logprobs"], trained, self.vllm_importance_sampling_mode, *bounds
-            )
-        return logps, entropies, None
 
     # --- logs --------------------------------------------------------------------------------------------------------
 
@@ -396,20 +308,3 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, GRPOTrainer):
         self.control = control
         self.model.train(training)
         return metrics
-
-
-def named(reward: str) -> Callable[..., Any]:
-    """A reward function as TRL wants one, by name only: episodes are scored before credit, not by TRL."""
-
-    def score(**_: Any) -> Any:
-        raise NotImplementedError("episodes are scored once, as they are played")
-
-    score.__name__ = reward
-    return score
-
-
-def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
-    """The local backend over the live policy."""
-    from agentspec.llm.local import LocalLLM
-
-    return LocalLLM(model, tokenizer, name="policy", batching=batching)

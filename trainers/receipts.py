@@ -23,6 +23,10 @@ LOSS_SETTINGS = (
     "epsilon_high",
     "delta",
     "beta",
+    "reference",
+    "use_bias_correction_kl",
+    "top_entropy_quantile",
+    "max_completion_length",
     "num_iterations",
     "steps_per_generation",
     "gradient_accumulation_steps",
@@ -83,7 +87,7 @@ def receipt_record(
         played: id and return of every episode of the round.
         rows: of all ranks, as of `receipt_rows`.
         padding_rows: rows that fill up micro-batches and train nothing.
-        denominator: trained tokens that the loss is divided by.
+        denominator: what the loss is divided by (:mod:`trainers.losses`).
         settings: as of `settings`.
     """
     return {

@@ -112,7 +112,7 @@ def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:
     return ScaffoldState(
         step=data["step"],
         round=data["round"],
-        buffered=tuple(tuple(_row_from_json(r) for r in hand) for hand in data["buffered"]),
+        buffered=tuple(tuple(_row_from_json(r) for r in rows) for rows in data["buffered"]),
         memory=None if data["memory"] is None else base64.b64decode(data["memory"]),
     )
 

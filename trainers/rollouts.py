@@ -13,7 +13,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from torch import nn
+
 from agentspec.episode import Job, Runner
+from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
@@ -104,3 +107,10 @@ def _scored(trajectory: Trajectory, rewards: RewardSet) -> ScoredEpisode:
             raise
         trajectory = replace(trajectory, status="failed", error=f"not finite: {error}")
     return ScoredEpisode(trajectory, score)
+
+
+def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
+    """The local backend over the live policy."""
+    from agentspec.llm.local import LocalLLM
+
+    return LocalLLM(model, tokenizer, name="policy", batching=batching)

@@ -170,10 +170,3 @@ def seal_of(folder: Path) -> dict[str, Any]:
 def paths_called(trajectories: Sequence[Trajectory]) -> set[str]:
     """`module/purpose (credit)` of everything that the episodes asked the model."""
     return {f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions}
-
-
-def transcript(trajectory: Trajectory) -> str:
-    """What the agent did, for TRL's completion logs."""
-    if not trajectory.scorable:
-        return f"[failed] {trajectory.error}"
-    return "\n".join(t.action_text for t in trajectory.transitions)

@@ -7,12 +7,49 @@ round is one stretch awake. The engine itself is spoken to by :mod:`agentspec.ll
 
 from __future__ import annotations
 
+import importlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
+
+from agentspec.registry import SpecError
+
+if TYPE_CHECKING:
+    from trainers.config import ScaffoldConfig
+
+BATCH_INVARIANT = "VLLM_BATCH_INVARIANT"
+"""The environment variable that asks vLLM for its batch-invariant mode."""
+_LEAST_CAPABILITY = (8, 0)
+
+
+def prepare_vllm(config: ScaffoldConfig) -> None:
+    """Make the engine that is about to be built batch-invariant, if `vllm_batch_invariant` asks for it.
+
+    vLLM's mode replaces its matrix products, reductions and choice of attention by such that treat a request alike in
+    every batch (its page "Batch Invariance"; NVIDIA GPUs of compute capability 8.0 and above).
+
+    Raises:
+        SpecError: this process's device does not have it, or vLLM does not take it from here.
+    """
+    if not config.vllm_batch_invariant:
+        return
+    if not torch.cuda.is_available() or torch.cuda.get_device_capability() < _LEAST_CAPABILITY:
+        found = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device"
+        raise SpecError(
+            f"vllm_batch_invariant needs an NVIDIA GPU of compute capability 8.0 or above; found {found}; leave it out"
+        )
+    if os.environ.get(BATCH_INVARIANT) != "1":
+        os.environ[BATCH_INVARIANT] = "1"
+        # TRL has imported vLLM by now: releases that read the variable on import would not see it.
+        if not getattr(importlib.import_module("vllm.envs"), BATCH_INVARIANT, False):
+            raise SpecError(
+                "vllm_batch_invariant came too late: this release of vLLM reads it when it is imported; set "
+                f"{BATCH_INVARIANT}=1 in the environment of the whole process"
+            )
 
 
 @contextmanager

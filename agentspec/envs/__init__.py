@@ -17,8 +17,17 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    "agentspec/MiniGrid-v0": "agentspec.envs.minigrid.env:MiniGridEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
+
+NUMERIC = {
+    "agentspec/DeliveryBenchDiscrete-v0": "agentspec.envs.deliverybench.discrete:make",
+}
+"""The same worlds with numbers for actions and observations, for other libraries; agents play the ones above."""
+
+STEP_LIMITS = {"agentspec/DeliveryBench-v0": 5000, "agentspec/DeliveryBenchDiscrete-v0": 5000}
+"""Environment id -> steps after which every episode is cut."""
 
 _PUBLIC = {
     "ContractError": "agentspec.envs.contract",
@@ -27,15 +36,25 @@ _PUBLIC = {
     "make_env": "agentspec.envs.making",
 }
 
-__all__ = ["ENTRY_POINTS", "ContractError", "check_environment", "environment_id", "make_env", "register_all"]
+__all__ = [
+    "ENTRY_POINTS",
+    "NUMERIC",
+    "STEP_LIMITS",
+    "ContractError",
+    "check_environment",
+    "environment_id",
+    "make_env",
+    "register_all",
+]
 
 
 def register_all() -> None:
     """Register every environment with gymnasium; registering again changes nothing."""
-    for name, entry_point in ENTRY_POINTS.items():
+    for name, entry_point in {**ENTRY_POINTS, **NUMERIC}.items():
         if name not in gymnasium.registry:
             # The passive checker would validate every observation of every step; the test suite checks them instead.
-            gymnasium.register(id=name, entry_point=entry_point, disable_env_checker=True)
+            limit = STEP_LIMITS.get(name)
+            gymnasium.register(name, entry_point, max_episode_steps=limit, disable_env_checker=True)
 
 
 def __getattr__(name: str) -> Any:
@@ -53,4 +72,10 @@ register(
     "deliverybench",
     "agentspec/DeliveryBench-v0",
     "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+)
+register(
+    "env",
+    "minigrid",
+    "agentspec/MiniGrid-v0",
+    "MiniGrid and BabyAI grids: egocentric text, success within 100 steps, the paper's ten tasks",
 )

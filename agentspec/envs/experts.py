@@ -41,30 +41,23 @@ class NoPlayer(SpecError):  # noqa: N818 - read as a sentence in the message of 
     """An environment that has no player of this role."""
 
 
-def roles(env_id: str) -> dict[str, str]:
-    """Role -> "module:factory", as the class of a Gymnasium id declares them; empty where it declares none."""
-    import gymnasium
+def roles(env: str) -> dict[str, str]:
+    """Role -> "module:factory", as the class of an environment declares them; empty where it declares none."""
+    from agentspec.envs.making import environment_class
 
-    if ":" in env_id:
-        import_module(env_id.partition(":")[0])
-        env_id = env_id.partition(":")[2]
-    entry = gymnasium.spec(env_id).entry_point
-    if isinstance(entry, str):
-        module, _, name = entry.partition(":")
-        entry = getattr(import_module(module), name)
-    return dict(getattr(entry, "experts", {}))
+    return dict(getattr(environment_class(env), "experts", {}))
 
 
-def player(env_id: str, role: str, options: Mapping[str, Any], rng: random.Random, **parameters: Any) -> Player:
-    """The player of `role` for one episode of the environment `env_id` made with `options`.
+def player(env: str, role: str, options: Mapping[str, Any], rng: random.Random, **parameters: Any) -> Player:
+    """The player of `role` for one episode of the environment `env` (a name or id) made with `options`.
 
     Raises:
         NoPlayer: the environment declares none of this role.
         TypeError: the player does not take one of the parameters.
     """
-    declared = roles(env_id)
+    declared = roles(env)
     if role not in declared:
-        raise NoPlayer(f"{env_id} has no player {role!r} (it has: {', '.join(declared) or 'none'}); choose a model")
+        raise NoPlayer(f"{env} has no player {role!r} (it has: {', '.join(declared) or 'none'}); choose a model")
     module, _, name = declared[role].partition(":")
     factory: Factory = getattr(import_module(module), name)
     return factory(options, rng, **parameters)

@@ -147,12 +147,12 @@ def _client(generation: Any) -> Any:
 class Colocated:
     """The engine inside this process (``vllm_mode: colocate``), of TRL's ``VLLMGeneration``.
 
-    Requests join and leave between two of its steps (:mod:`agentspec.llm.batching`, ``eager``).
+    Requests join and leave between two of its steps (`agentspec.llm.batching`, `continuous`).
     """
 
     def __init__(self, generation: Any) -> None:
         self._generation = generation
-        self._batcher: Batcher[Job] = Batcher(self._run, batching="eager")
+        self._batcher: Batcher[Job] = Batcher(self._run, batching="continuous")
         self._names = map("scaffold-{}".format, itertools.count())
 
     async def sample(self, episode: str, number: int, job: Job) -> None:

@@ -27,9 +27,7 @@ def decision(text: str, input: AgentInput, rationale: str) -> Decision:
 
 
 def _player(task: Task, role: str, rng: random.Random, parameters: Mapping[str, Any]) -> Player:
-    from agentspec.episode import environment_id
-
-    return player(environment_id(task.env), role, task.options, rng, **parameters)
+    return player(task.env, role, task.options, rng, **parameters)
 
 
 class RuleBased(Stateless):
@@ -41,7 +39,7 @@ class RuleBased(Stateless):
 
     declaration = Declaration(
         "the environment's scripted expert: no model, a baseline and demonstrator",
-        envs=("deliverybench",),
+        envs=("deliverybench", "minigrid"),
         aliases=("simple",),
     )
 
@@ -84,7 +82,7 @@ class RandomLegal(Stateless):
 
     declaration = Declaration(
         "a random sensible action: no model, the floor",
-        envs=("deliverybench",),
+        envs=("deliverybench", "minigrid"),
         name="random",
     )
 

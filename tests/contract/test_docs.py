@@ -12,13 +12,15 @@ from agentspec.registry import REGISTRY
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-def test_the_table_of_calls_is_current() -> None:
-    location = importlib.util.spec_from_file_location("update_modules", DOCS / "update_modules.py")
+@pytest.mark.parametrize("name", ["modules", "training"])
+def test_generated_tables_are_current(name: str) -> None:
+    pytest.importorskip("torch")
+    location = importlib.util.spec_from_file_location(f"update_{name}", DOCS / f"update_{name}.py")
     assert location and location.loader
     script = importlib.util.module_from_spec(location)
     location.loader.exec_module(script)
-    page = (DOCS / "modules.md").read_text(encoding="utf-8")
-    assert script.updated(page) == page, "run `python docs/update_modules.py`"
+    page = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    assert script.updated(page) == page, f"run `python docs/update_{name}.py`"
 
 
 @pytest.mark.parametrize("kind", ["memory", "reasoning", "reflection"])

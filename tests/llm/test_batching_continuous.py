@@ -1,4 +1,4 @@
-"""Continuous batches: who is in each step of the work, and that nobody waits for ever or goes on too early."""
+"""Who is in each step of the work, and that nobody waits for ever or goes on too early."""
 
 from __future__ import annotations
 
@@ -6,24 +6,11 @@ import asyncio
 import random
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from agentspec.llm.batching import Batcher, Batching
-from agentspec.llm.pace import Pace
-
-
-class FixedPace(Pace):
-    """Waits for a given time."""
-
-    def __init__(self, grace_s: float) -> None:
-        super().__init__()
-        self._grace_s = grace_s
-
-    @property
-    def grace_s(self) -> float:
-        return self._grace_s
 
 
 class Steps:
@@ -34,7 +21,6 @@ class Steps:
         self.steps: list[str] = []
         self.running = False
         self.fail_at = self.hold_at = -1
-        self.tells_rest = False
         self.go_on = threading.Event()
         self.ended = threading.Event()
 
@@ -51,8 +37,7 @@ class Steps:
                 left = {job: n - 1 for job, n in left.items()}
                 done = [job for job, n in left.items() if n == 0]
                 left = {job: n for job, n in left.items() if n}
-                rest = {"rest": max(left.values(), default=0)} if self.tells_rest else {}
-                left |= {job: length(job) for job in self.batcher.exchange(done, **rest)}
+                left |= {job: length(job) for job in self.batcher.exchange(done)}
         finally:
             self.running = False
             self.ended.set()
@@ -78,11 +63,11 @@ def run(coroutine: Any) -> Any:
     return asyncio.run(asyncio.wait_for(coroutine, timeout=20))
 
 
-def steps_of(batching: Batching, episodes: dict[str, Sequence[int]], **pauses: float) -> list[str]:
+def steps_of(batching: Batching, episodes: dict[str, Sequence[int]]) -> list[str]:
     machine = Steps(batching)
 
     async def main() -> None:
-        await asyncio.gather(*[play(machine.batcher, e, n, pauses.get(e, 0.0)) for e, n in episodes.items()])
+        await asyncio.gather(*[play(machine.batcher, e, n) for e, n in episodes.items()])
 
     run(main())
     return machine.steps
@@ -90,41 +75,19 @@ def steps_of(batching: Batching, episodes: dict[str, Sequence[int]], **pauses: f
 
 def test_an_answer_is_delivered_at_once_and_its_episode_asks_again_beside_the_others() -> None:
     episodes = {"a": [1, 2, 1], "b": [3, 1]}
-    # One of two is a quarter: a asks again after its first step; both are answered after the third.
-    expected = ["a0 b0", "a1 b0", "a1 b0", "a2 b1"]
-    assert steps_of("ordered", episodes) == expected
-    assert steps_of("ordered", episodes, a=0.03) == expected
+    # a asks again after its first step; both are answered after the third.
+    assert steps_of("continuous", episodes) == ["a0 b0", "a1 b0", "a1 b0", "a2 b1"]
     assert steps_of("closed", episodes) == ["a0 b0", "b0", "b0", "a1 b1", "a1", "a2"]
 
 
-def test_a_batch_is_filled_up_when_a_quarter_was_answered() -> None:
-    # Eight episodes: a alone is less than a quarter of them, a and b are one.
-    episodes = {"a": [1, 1], "b": [2, 1], **{e: [4] for e in "cdefgh"}}
-    rest = "c0 d0 e0 f0 g0 h0"
-    assert steps_of("ordered", episodes) == [f"a0 b0 {rest}", f"b0 {rest}", f"a1 b1 {rest}", rest]
-
-
-def test_nobody_joins_a_batch_that_is_nearly_done() -> None:
-    """What is asked while others write their last eight tokens begins with the next batch."""
-    machine = Steps("ordered")
-    machine.tells_rest = True
-
-    async def main() -> None:
-        await asyncio.gather(play(machine.batcher, "a", [1, 1, 1]), play(machine.batcher, "b", [10]))
-
-    run(main())
-    # After the first step b has nine left, after the second eight.
-    assert machine.steps == ["a0 b0", "a1 b0", *["b0"] * 8, "a2"]
-
-
 @pytest.mark.parametrize("at_once", [3, 8])
-def test_who_is_in_a_step_does_not_depend_on_timing(at_once: int) -> None:
+def test_who_is_in_a_closed_batch_does_not_depend_on_timing(at_once: int) -> None:
     """Also with episodes that begin as others end."""
     draw = random.Random(0)
     episodes = {e: [draw.randint(1, 6) for _ in range(draw.randint(1, 4))] for e in "abcdefgh"}
 
     def timed(seed: int) -> list[str]:
-        machine, times = Steps("ordered"), random.Random(seed)
+        machine, times = Steps("closed"), random.Random(seed)
 
         async def main() -> None:
             gate = asyncio.Semaphore(at_once)
@@ -143,8 +106,8 @@ def test_who_is_in_a_step_does_not_depend_on_timing(at_once: int) -> None:
     assert sum(len(step.split()) for step in first) == sum(map(sum, episodes.values()))
 
 
-def test_eager_waits_for_nobody() -> None:
-    machine = Steps("eager")
+def test_a_continuous_batch_waits_for_nobody() -> None:
+    machine = Steps("continuous")
 
     async def main() -> None:
         a_is_over = asyncio.Event()
@@ -165,74 +128,8 @@ def test_eager_waits_for_nobody() -> None:
     assert {"a1 c0", "a2 c0"} <= set(machine.steps)
 
 
-@pytest.mark.parametrize("grace_s", [0.0, 10.0])
-def test_eager_waits_as_long_as_those_who_act_are_worth_it(grace_s: float) -> None:
-    machine = Steps("eager")
-    machine.batcher._pace = FixedPace(grace_s)
-    episodes = {"a": [1, 1], "b": [1, 1], "c": [40]}
-
-    async def main() -> None:
-        pauses = {"a": 0.01, "b": 0.02, "c": 0.0}
-        await asyncio.gather(*[play(machine.batcher, e, n, pauses[e]) for e, n in episodes.items()])
-
-    run(main())
-    together = ["a0 b0 c0", "a1 b1 c0", *["c0"] * 38]
-    assert (machine.steps == together) == bool(grace_s)
-    # Without, the others have long gone on when the first is back.
-    assert machine.steps[0] == "a0 b0 c0" and (bool(grace_s) or machine.steps[1] == "c0")
-
-
-def test_waiting_pays_for_those_who_are_back_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr("agentspec.llm.pace.time.perf_counter", lambda: clock[0])
-    pace = Pace()
-
-    def away(episode: str, seconds: float) -> None:
-        pace.answered(episode)
-        clock[0] += seconds
-        pace.asked(episode)
-
-    for _ in range(50):
-        pace.worked(0.1)
-        away("a", 0.04)
-    assert (pace.step_s, pace.away_s) == (pytest.approx(0.1, rel=1e-4), pytest.approx(0.04, rel=1e-4))
-    assert pace.grace_s == pytest.approx(0.05, rel=1e-4)  # half a step
-    for _ in range(50):
-        away("b", 0.06)
-    assert pace.grace_s == 0.0
-    # What never comes back, or was never answered, is not counted.
-    pace.answered("c")
-    pace.ended("c")
-    clock[0] += 1000
-    pace.asked("c")
-    pace.asked("d")
-    assert pace.away_s == pytest.approx(0.06, rel=1e-3)
-
-
-def test_patience_ends_in_a_running_batch_too() -> None:
-    machine = Steps("ordered", patience_s=0.05)
-
-    async def main() -> None:
-        a_is_over = asyncio.Event()
-
-        async def waits_for_a() -> None:
-            await play(machine.batcher, "b", [1])
-            machine.batcher.enter("b")
-            await a_is_over.wait()
-            machine.batcher.leave("b")
-
-        async def long() -> None:
-            await play(machine.batcher, "a", [3])
-            a_is_over.set()
-
-        await asyncio.gather(waits_for_a(), long())
-
-    run(main())
-    assert machine.steps == ["a0 b0", "a0", "a0"]
-
-
-def test_what_one_episode_asks_at_once_is_answered_together() -> None:
-    machine = Steps("ordered")
+def test_what_one_episode_asks_at_once_is_answered_as_it_is_finished() -> None:
+    machine = Steps("continuous")
     answered: list[str] = []
 
     async def ask(number: int, n: int) -> None:
@@ -248,13 +145,12 @@ def test_what_one_episode_asks_at_once_is_answered_together() -> None:
         await asyncio.gather(several(), play(machine.batcher, "b", [2, 4]))
 
     run(main())
-    # b was answered after the second step and did not wait for a, nor a for it.
     assert machine.steps == ["a0 a1 b0", "a1 b0", "a1 b1", "b1", "b1", "b1"]
-    assert answered == ["a0 after 3", "a1 after 3"]
+    assert answered == ["a0 after 1", "a1 after 3"]
 
 
 def test_a_stranger_joins_and_waits_for_nobody() -> None:
-    machine = Steps("ordered")
+    machine = Steps("continuous")
 
     async def stranger() -> None:
         for turn in range(3):
@@ -269,7 +165,7 @@ def test_a_stranger_joins_and_waits_for_nobody() -> None:
     assert machine.steps == ["s0 t", "s1 t", "s2 t"]
 
 
-@pytest.mark.parametrize("batching", ["ordered", "eager"])
+@pytest.mark.parametrize("batching", get_args(Batching))
 def test_strangers_who_ask_all_the_time_do_not_keep_the_episodes_out(batching: Batching) -> None:
     machine = Steps(batching)
 
@@ -294,7 +190,7 @@ def test_strangers_who_ask_all_the_time_do_not_keep_the_episodes_out(batching: B
     assert [step.split()[0] for step in machine.steps if "a" in step] == ["a0", "a1", "a1"]
 
 
-@pytest.mark.parametrize("batching", ["ordered", "eager"])
+@pytest.mark.parametrize("batching", get_args(Batching))
 def test_the_last_go_on_only_when_nothing_is_under_way(batching: Batching) -> None:
     """Who has the last answer may change the model: the worker must be through with it."""
     machine = Steps(batching)
@@ -310,7 +206,7 @@ def test_the_last_go_on_only_when_nothing_is_under_way(batching: Batching) -> No
 
 
 def test_a_failure_reaches_those_in_the_batch_only() -> None:
-    machine = Steps("ordered")
+    machine = Steps("continuous")
     machine.fail_at = 2
 
     async def main() -> list[Any]:
@@ -324,39 +220,31 @@ def test_a_failure_reaches_those_in_the_batch_only() -> None:
     assert machine.steps == ["a0 b0 c0", "b0 c0", "d0"]
 
 
-@pytest.mark.parametrize("while_in_batch", [True, False])
-def test_an_episode_cancelled_does_not_hold_the_others(while_in_batch: bool) -> None:
-    machine = Steps("ordered")
-    machine.hold_at = 2 if while_in_batch else -1
+def test_an_episode_cancelled_in_the_batch_does_not_hold_the_others() -> None:
+    machine = Steps("continuous")
+    machine.hold_at = 2
 
     async def main() -> None:
-        # In the batch with its long answer, or out of it, where it acts for an hour.
-        a = asyncio.create_task(play(machine.batcher, "a", [4] if while_in_batch else [1, 1], pause_s=3600))
+        a = asyncio.create_task(play(machine.batcher, "a", [4], pause_s=3600))
         b = asyncio.create_task(play(machine.batcher, "b", [1, 1, 5]))
-        while len(machine.steps) < (2 if while_in_batch else 1):
+        while len(machine.steps) < 2:
             await asyncio.sleep(0.001)
-        await asyncio.sleep(0.02)
-        assert not b.done()
         a.cancel()
         await asyncio.sleep(0.02)
         machine.go_on.set()
         await b
 
     run(main())
-    if while_in_batch:
-        assert machine.steps == ["a0 b0", "a0 b1", "a0 b2", "a0 b2", "b2", "b2", "b2"]
-    else:
-        assert machine.steps == ["a0 b0", "b1", *["b2"] * 5]
+    assert machine.steps == ["a0 b0", "a0 b1", "a0 b2", "a0 b2", "b2", "b2", "b2"]
 
 
 def test_a_batch_nobody_waits_for_ends_and_the_next_loop_starts_clean() -> None:
-    machine = Steps("ordered")
+    machine = Steps("continuous")
 
     async def never_leaves() -> None:
         machine.batcher.enter("a")
         never_ends = asyncio.create_task(play(machine.batcher, "b", [10**9]))
         await machine.batcher.submit("a", 0, "a0:1")
-        # The worker waits for a now.
         await asyncio.sleep(0.01)
         never_ends.cancel()
 
@@ -368,5 +256,5 @@ def test_a_batch_nobody_waits_for_ends_and_the_next_loop_starts_clean() -> None:
 
 
 def test_an_unknown_way_of_batching_is_refused() -> None:
-    with pytest.raises(ValueError, match="batching is 'sometimes'; expected one of ordered, eager, closed"):
+    with pytest.raises(ValueError, match="batching is 'sometimes'; expected one of continuous, closed"):
         Steps("sometimes")  # type: ignore[arg-type]

@@ -158,7 +158,7 @@ def test_choices_are_sampled_by_their_probability():
 
 
 def test_single_choice_needs_no_model(monkeypatch):
-    llm = tiny(batching="ordered")
+    llm = tiny(batching="closed")
     monkeypatch.setattr(llm._engine.model, "forward", None)
     monkeypatch.setattr(llm._engine.model, "check", lambda: None)
     (completion,) = ask(llm, choices=("go",)).completions
@@ -208,7 +208,7 @@ def test_end_tokens_stop_and_stay_in_the_ids():
 
 
 def test_top_k_and_top_p_renormalise():
-    from agentspec.llm.local_rows import filter_top
+    from agentspec.llm.local.sampling import filter_top
 
     logprobs = torch.tensor([0.5, 0.1, 0.3, 0.1]).log()
     # Top two of .5, .3: 5/8 and 3/8.
@@ -371,7 +371,7 @@ def test_only_the_request_at_fault_fails(monkeypatch):
 
 
 def test_long_prompts_are_read_in_pieces(monkeypatch):
-    monkeypatch.setattr("agentspec.llm.local_engine._TOKENS_PER_FORWARD", {"cpu": 16})
+    monkeypatch.setattr("agentspec.llm.local.engine._TOKENS_PER_FORWARD", {"cpu": 16})
     got = converse_all(tiny(), ["a", "bbb", "cc"])
     monkeypatch.undo()
     expected = converse_all(tiny(), ["a", "bbb", "cc"])

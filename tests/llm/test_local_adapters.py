@@ -11,7 +11,7 @@ import torch
 
 from agentspec.llm.base import LLMError, Request, Sampled, assistant, system, user
 from agentspec.llm.local import LocalLLM
-from agentspec.llm.local_adapters import UNTAGGED, adapter_for
+from agentspec.llm.local.adapters import UNTAGGED, adapter_for
 from agentspec.types import CallTag, LLMCall
 from tests.llm.helpers import request
 from tests.tiny import tiny_model, tiny_tokenizer

@@ -52,7 +52,7 @@ def test_writing_rows_as_one_padded_batch(name, monkeypatch):
     torch.manual_seed(0)
     model = _architectures()[name]().eval()
     expected = converse_all(LocalLLM(model, tiny_tokenizer(), name=name), ["a", "bbb", "cccccc"])
-    monkeypatch.setattr("agentspec.llm.local_attention._BATCHED_FROM", {"cpu": 2})
+    monkeypatch.setattr("agentspec.llm.local.attention._BATCHED_FROM", {"cpu": 2})
     got = converse_all(LocalLLM(model, tiny_tokenizer(), name=name), ["a", "bbb", "cccccc"])
     for x, y in zip(got, expected, strict=True):
         assert [c.completions[0].token_ids for c in x] == [c.completions[0].token_ids for c in y]
@@ -69,6 +69,6 @@ def test_architectures_that_do_not_fit_are_refused():
 
 def test_a_wrong_forward_is_noticed_before_it_is_used(monkeypatch):
     llm = tiny()
-    monkeypatch.setattr("agentspec.llm.local_attention._causal_mask", lambda *a: None)
+    monkeypatch.setattr("agentspec.llm.local.attention._causal_mask", lambda *a: None)
     with pytest.raises(LLMError, match="does not compute Qwen3ForCausalLM"):
         ask(llm)

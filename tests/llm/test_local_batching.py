@@ -15,7 +15,7 @@ import torch
 from agentspec.llm.base import LLMError, Sampled, assistant, system, user
 from agentspec.llm.batching import Batching
 from agentspec.llm.local import LocalLLM
-from agentspec.llm.local_rows import Job
+from agentspec.llm.local.rows import Job
 from agentspec.types import LLMCall, Sampling
 from tests.llm.helpers import request
 from tests.llm.test_local import close, recomputed, tiny
@@ -106,20 +106,19 @@ def test_continuous_batches_take_fewer_forwards(monkeypatch: pytest.MonkeyPatch)
         rows = counted(llm, monkeypatch)
         play(llm)
         forwards[batching] = len(rows)
-    assert forwards["ordered"] < 0.9 * forwards["closed"]
-    assert forwards["eager"] < 0.9 * forwards["closed"]
+    assert forwards["continuous"] < 0.9 * forwards["closed"]
 
 
 @pytest.mark.parametrize("options", [{}, {"max_batch": 3}, {"at_once": 2}], ids=str)
-def test_ordered_batches_are_repeatable_to_the_last_bit(options: dict[str, int]) -> None:
+def test_closed_batches_are_repeatable_to_the_last_bit(options: dict[str, int]) -> None:
     at_once = options.get("at_once", 5)
     bounds = {k: v for k, v in options.items() if k != "at_once"}
-    first, *others = [exactly(play(tiny(batching="ordered", **bounds), seed, at_once)) for seed in range(4)]
+    first, *others = [exactly(play(tiny(batching="closed", **bounds), seed, at_once)) for seed in range(4)]
     assert others == [first] * 3
 
 
 def test_rows_that_join_take_over_what_running_rows_have_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    llm = tiny(batching="eager")
+    llm = tiny(batching="continuous")
     llm._engine._stop_ids = frozenset()  # the first answer lasts
     rows = counted(llm, monkeypatch)
     static = system("Rules of the house. " * 20)
@@ -139,13 +138,13 @@ def test_rows_that_join_take_over_what_running_rows_have_read(monkeypatch: pytes
     assert short.usage.cached_tokens >= shared
 
 
-@pytest.mark.parametrize("batching", ["ordered", "eager"])
+@pytest.mark.parametrize("batching", get_args(Batching))
 @pytest.mark.parametrize("tokens_per_forward", [16, 512])
 def test_slots_that_are_continued_while_others_still_copy_from_them(
     batching: Batching, tokens_per_forward: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rebuilt prompts of all lengths, several samples, short answers: slots change hands at every forward."""
-    monkeypatch.setattr("agentspec.llm.local_engine._TOKENS_PER_FORWARD", {"cpu": tokens_per_forward})
+    monkeypatch.setattr("agentspec.llm.local.engine._TOKENS_PER_FORWARD", {"cpu": tokens_per_forward})
     llm = tiny(batching=batching, max_batch=5, max_cache_tokens=1024)
     draw = random.Random(5)
     words = [f"word{i} " for i in range(24)]
@@ -172,7 +171,7 @@ def test_slots_that_are_continued_while_others_still_copy_from_them(
 def test_a_slot_that_changes_hands_is_copied_first(monkeypatch: pytest.MonkeyPatch) -> None:
     # Forwards of 16 tokens: ``first`` reads 16, 16 and is done; ``copies`` has not yet copied its 32 tokens when
     # ``takes``, the next prompt of the same episode, continues the slot from its 20th token on and makes it larger.
-    monkeypatch.setattr("agentspec.llm.local_engine._TOKENS_PER_FORWARD", {"cpu": 16})
+    monkeypatch.setattr("agentspec.llm.local.engine._TOKENS_PER_FORWARD", {"cpu": 16})
     llm = tiny()
     base, one = list(range(40, 72)), Sampling(max_tokens=1)
     first = Job("a", base, one)
@@ -180,7 +179,7 @@ def test_a_slot_that_changes_hands_is_copied_first(monkeypatch: pytest.MonkeyPat
     takes = Job("a", [*base[:20], *range(100, 200)], one)
     joining = [takes]
 
-    def exchange(done: Sequence[Job], rest: int) -> list[Job]:
+    def exchange(done: Sequence[Job]) -> list[Job]:
         return [joining.pop() for job in done if job is first]
 
     llm._engine.run([first, copies], exchange)
@@ -205,7 +204,7 @@ def test_what_an_ended_episode_cached_is_anyones_when_others_join() -> None:
     assert None in owners() and "a" not in owners()
 
 
-@pytest.mark.parametrize("batching", ["ordered", "eager"])
+@pytest.mark.parametrize("batching", get_args(Batching))
 def test_only_the_request_at_fault_fails_while_others_write(
     batching: Batching, monkeypatch: pytest.MonkeyPatch, expected: list[Any]
 ) -> None:
@@ -239,7 +238,7 @@ def test_only_the_request_at_fault_fails_while_others_write(
 
 
 def test_the_model_is_itself_again_when_the_last_answer_is_there() -> None:
-    llm = tiny(batching="ordered")
+    llm = tiny(batching="continuous")
     attention = llm.model.config._attn_implementation
     for _ in range(3):
         play(llm)

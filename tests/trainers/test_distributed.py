@@ -35,6 +35,7 @@ from tests.trainers.fake_vllm import use_fake_vllm
 from tests.trainers.test_data_parallel import built_episode, make_trainer
 from tests.trainers.test_supo import configured
 from trainers import grpo as grpo_module
+from trainers import policy_loss
 from trainers.distributed import check_layout, check_trained, keep_precision, leave_group
 from trainers.runlog import RunLog
 from trainers.tree import model as tree_model
@@ -212,7 +213,7 @@ def step_in_bfloat16() -> None:
     """One update as the shipped layout computes it on a GPU."""
     use_fake_vllm(pytest.MonkeyPatch(), tiny_tokenizer().eos_token_id)
     shard_on_cpu("bf16")
-    compute = grpo_module.rows_logprobs
+    compute = policy_loss.rows_logprobs
 
     def checked(*args: Any, **kwargs: Any) -> Any:
         logps, entropies = compute(*args, **kwargs)
@@ -220,7 +221,7 @@ def step_in_bfloat16() -> None:
         return logps, entropies
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(grpo_module, "rows_logprobs", checked)
+    patch.setattr(policy_loss, "rows_logprobs", checked)
     patch.setattr(grpo_module, "collect", instead_of_playing(lambda jobs: [built_episode("tree", j) for j in jobs]))
     settings = {"use_vllm": True, "bf16": True, "max_steps": 1}
     make_trainer(Path(sys.argv[2]), "tree", **settings).train()

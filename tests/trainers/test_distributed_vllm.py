@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import os
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,7 +27,7 @@ from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import audit
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.runlog import RunLog
-from trainers.vllm import base_kept, importance_ratio
+from trainers.vllm import BATCH_INVARIANT, base_kept, importance_ratio, prepare_vllm
 
 
 def adapted_model(tokenizer: Any, **changes: Any) -> Any:
@@ -144,9 +147,40 @@ def test_what_cannot_work_with_vllm_is_refused(tmp_path: Path, trainer: Any) -> 
     for changes, reason in (
         ({"vllm_tensor_parallel_size": 2}, "vllm_mode: server"),
         ({"vllm_importance_sampling_mode": "sequence_mask"}, "speaks of rows"),
+        ({"vllm_batch_invariant": True, "use_vllm": False}, "without vLLM"),
+        ({"vllm_batch_invariant": True, "vllm_mode": "server"}, "VLLM_BATCH_INVARIANT=1 vllm serve"),
+        ({"vllm_batch_invariant": True}, "no CUDA device"),
     ):
         with pytest.raises(SpecError, match=reason):
             trainer(tmp_path, **changes)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+@pytest.mark.parametrize("capability", [(8, 0), (7, 5)])
+def test_vllm_is_asked_to_be_batch_invariant_where_it_can_be(
+    seen: bool, capability: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    envs: Any = ModuleType("vllm.envs")
+    envs.__getattr__ = lambda name: seen and os.environ.get(name) == "1"
+    monkeypatch.setitem(sys.modules, "vllm.envs", envs)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
+    monkeypatch.setenv(BATCH_INVARIANT, "0")
+    config: Any = SimpleNamespace(vllm_batch_invariant=True)
+    if capability < (8, 0):
+        with pytest.raises(SpecError, match="found a GPU"):
+            prepare_vllm(config)
+        assert os.environ[BATCH_INVARIANT] == "0"
+    elif not seen:
+        with pytest.raises(SpecError, match="reads it when it is imported"):
+            prepare_vllm(config)
+    else:
+        prepare_vllm(config)
+        assert os.environ[BATCH_INVARIANT] == "1"
+    monkeypatch.setenv(BATCH_INVARIANT, "0")
+    prepare_vllm(SimpleNamespace(vllm_batch_invariant=False))  # type: ignore[arg-type]
+    assert os.environ[BATCH_INVARIANT] == "0"
 
 
 def test_trl_has_what_is_used_of_it() -> None:

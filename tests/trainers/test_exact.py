@@ -24,6 +24,7 @@ from tests.trainers.builders import call, episode, instead_of_playing
 from tests.trainers.played import toy_trainer
 from tests.trainers.test_grpo import RETURNS, conversations, our_trainer, settings
 from trainers import grpo as grpo_module
+from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.finite import NonFiniteError, require_finite, without_dropout
 from trainers.forward import rows_logprobs
@@ -190,6 +191,15 @@ def test_rewards_are_computed_once_per_episode(tmp_path: Path, monkeypatch: Any)
     monkeypatch.setattr(RewardSet, "_values", counted)
     toy_trainer(tmp_path, rewards={"env": 1.0, "invalid_action": 0.1}, max_steps=1).train()
     assert len(calls) == len(set(calls)) == 2 * 4  # two rewards, four episodes
+
+
+@pytest.mark.parametrize("loss_type", ["dr_grpo", "dppo", "bnpo"])
+def test_the_audit_knows_what_each_loss_divides_by(tmp_path: Path, loss_type: str) -> None:
+    toy_trainer(tmp_path, loss_type=loss_type, estimator="max_rl", rewards={"env": 1.0}, max_steps=1).train()
+    (finding,) = audit(tmp_path)
+    assert finding.violations == []
+    expected = 4 * ScaffoldConfig.max_completion_length if loss_type == "dr_grpo" else finding.trained
+    assert finding.denominator == expected > 0
 
 
 def test_no_optimiser_step_is_empty_while_rows_are_left(tmp_path: Path, monkeypatch: Any) -> None:

@@ -29,7 +29,7 @@ from datasets import Dataset
 
 from agentspec.llm.base import system, user
 from agentspec.llm.local import LocalLLM
-from agentspec.llm.local_rows import filter_top
+from agentspec.llm.local.sampling import filter_top
 from agentspec.llm.models import resolve
 from agentspec.llm.vllm import trl_backend
 from agentspec.trajectory import read_trajectories

@@ -6,7 +6,9 @@ the return of an episode is the net earnings. The end of the shift is the task's
 of steps or of allowed actions is not (`truncated`).
 
 In menu mode (`action_mode="menu"`) the action is one of `info["action_schema"].choices`; a native call is accepted too.
-`snapshot` and `restore` are exact, so that a search can try actions and groups of rollouts can start alike.
+An answer in JSON may carry a plan, `{"action": "WAIT(60)", "plan": "then fetch order 3"}`, which full texts show again.
+`snapshot` and `restore` are exact, so that a search can try actions and groups of rollouts can start alike; copies and
+pickles of an environment rest on them.
 """
 
 from __future__ import annotations
@@ -26,11 +28,15 @@ from gymnasium import spaces
 
 from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.city.generate import city_of
+from agentspec.envs.deliverybench.outcome import MAX_ACTION, Last, plan_of
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe, state_hash
-from agentspec.envs.deliverybench.view.menu import Option, options
-from agentspec.envs.deliverybench.view.observation import around, compact_text, full_text, instruction
-from agentspec.envs.deliverybench.world.engine import Outcome, World
+from agentspec.envs.deliverybench.view.compact import compact_text, menu_text
+from agentspec.envs.deliverybench.view.full import around, full_text
+from agentspec.envs.deliverybench.view.instruction import instruction
+from agentspec.envs.deliverybench.view.menu import MORE, Option, pages
+from agentspec.envs.deliverybench.world.engine import World
 from agentspec.envs.deliverybench.world.events import Progress, events_since
+from agentspec.envs.deliverybench.world.grammar import advertised
 from agentspec.envs.deliverybench.world.rules import Rules, rules_named
 from agentspec.envs.deliverybench.world.thinking import ThinkTime
 from agentspec.metrics import Metric
@@ -38,8 +44,13 @@ from agentspec.types import ActionError, ActionSchema
 
 CHARSET = string.printable
 MAX_TEXT = 100_000
-MAX_ACTION = 512
-SNAPSHOT_VERSION = 1
+STEP_LIMIT = 5000
+"""Steps after which every episode is cut, the limit registered with Gymnasium: some actions take no time."""
+
+SHORTEST_PLAYED_H = 1.0 / 60.0
+"""Least time that the profit of a cut episode is divided by."""
+
+SNAPSHOT_VERSION = 2
 
 Point = tuple[float, float]
 Observation = dict[str, Any]
@@ -55,7 +66,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         shift_hours: length of the shift in simulated hours.
         observation: "full" or "compact" text.
         action_mode: "native" calls, or one of a "menu" of choices.
-        max_steps: steps after which the episode is truncated; None leaves the rules' limit of actions.
+        max_steps: steps after which the episode is truncated, at most `STEP_LIMIT`; None leaves the rules' limit of
+            actions. The figures per hour of an episode cut like this divide by the time played.
         order_seed: "seed" (orders follow the reset seed), "original" (the one sequence of the original runner, whatever
             the seed), or a number.
         start_battery: battery of the scooter at the start (%), None as the rules say.
@@ -72,7 +84,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         "render_modes": ["rgb_array"],
         "render_fps": 4,
         "metrics": (
-            Metric("hourly_profit", "$/h", summary="growth of the balance per hour of the shift"),
+            Metric("hourly_profit", "$/h", summary="growth of the balance per hour of the shift, or played if cut"),
             Metric("net_earnings", "$", summary="growth of the balance"),
             Metric("deliveries", summary="orders delivered"),
         ),
@@ -105,8 +117,23 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         _check("render_mode", render_mode, (None, "rgb_array"))
         if isinstance(order_seed, str):
             _check("order_seed", order_seed, ("seed", "original"))
-        if max_steps is not None and max_steps < 1:
-            raise ValueError(f"max_steps is {max_steps}; expected at least 1, or None")
+        if max_steps is not None and not 1 <= max_steps <= STEP_LIMIT:
+            raise ValueError(f"max_steps is {max_steps}; expected 1 to {STEP_LIMIT}, or None")
+        self._arguments = {
+            "map": map,
+            "size": size,
+            "city_seed": city_seed,
+            "rules": rules,
+            "shift_hours": shift_hours,
+            "observation": observation,
+            "action_mode": action_mode,
+            "max_steps": max_steps,
+            "order_seed": order_seed,
+            "start_battery": start_battery,
+            "think_time": think_time,
+            "render_mode": render_mode,
+            "images": images,
+        }
         self.city = city_of(map, size, city_seed)
         self.rules = _adapted(rules_named(rules), max_steps, start_battery)
         self.think_time = ThinkTime.of(think_time)
@@ -152,9 +179,10 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         assert orders is None or isinstance(orders, int)
         self._world = World(self.city, self.rules, orders, self.shift_hours)
         self._cards = OfferCards(self._world.book)
-        self._steps = 0
+        self._steps = self._page = 0
+        self._plan = ""
         self._thought: tuple[int, int] | None = None
-        self._last = _Last()
+        self._last = Last()
         self._track: list[list[float | str]] = [[self._world.state.mode, *self._world.state.position]]
         return self.observe()
 
@@ -173,44 +201,54 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
     def step(self, action: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one action given as text; no text raises. After the end nothing happens any more."""
         world = self.world
-        if self._truncated and not world.state.ended:  # out of steps; the world itself knows its other ends
-            observation, info = self.observe()
-            return observation, 0.0, self._terminated, self._truncated, info
         text = str(action)
+        if self._terminated or self._truncated:
+            observation, info = self.observe(Last.after_end(text))
+            return observation, 0.0, self._terminated, self._truncated, info
         call, problem = self._native(text)
         before = Progress.of(world)
         balance = world.state.balance
         mode = world.state.mode
         thought, self._thought = self._thought or (1, 0), None
-        outcome = world.step(call, self.think_time.seconds(*thought))
+        turned = self.menu_mode and call == MORE.call and not problem
+        if turned:
+            outcome = world.pause("more choices", self.think_time.seconds(*thought))
+        else:
+            outcome = world.step(call, self.think_time.seconds(*thought))
+        self._page = self._page + 1 if turned else 0
+        self._plan = plan_of(text) or self._plan
         self._steps += 1
-        self._last = _Last.of(outcome, call, problem, events_since(before, world, outcome), thought)
+        self._last = Last.of(outcome, call, problem, events_since(before, world, outcome), thought)
         if world.state.position != tuple(self._track[-1][1:]):
             self._track.append([mode, *world.state.position])
         observation, info = self.observe()
         return observation, world.state.balance - balance, self._terminated, self._truncated, info
 
-    def observe(self) -> tuple[Observation, dict[str, Any]]:
-        """The current observation and info, without stepping (after `restore`, say)."""
-        world, last = self.world, self._last
+    def observe(self, last: Last | None = None) -> tuple[Observation, dict[str, Any]]:
+        """The current observation and info, without stepping (after `restore`, say).
+
+        `last` is what info says of the last step, if that is not the step that led here.
+        """
+        world, last = self.world, last or self._last
         view = describe(world, self._cards)
         if self.max_steps is not None:
             view["calls_left"] = max(0, self.max_steps - self._steps)
         self._menu = self._options(view)
-        choices = tuple(self._menu)
-        schema = replace(world.schema, choices=choices) if choices else world.schema
-        if self.compact:
-            # The menu shows what a success led to; only failures and payments need words.
-            said = last.error or (last.message if not choices or "delivered" in last.events else "")
-            text = compact_text(view, said, choices)
-        else:
-            text = full_text(view, around(self.city, world.state.position, view))
-            if choices:
-                text += "\n\nChoices: " + "; ".join(choices)
-        observation: Observation = {"text": _printable(text)}
+        observation: Observation = {"text": _printable(self._text(view))}
         if self.images:
             observation["image"] = self._picture()
-        return observation, self._info(view, schema)
+        schema = replace(advertised(world.schema), choices=tuple(self._menu))
+        return observation, self._info(view, schema, last)
+
+    @property
+    def page(self) -> int:
+        """How often "more choices" has been asked for since the last action."""
+        return self._page
+
+    @property
+    def menu(self) -> tuple[Option, ...]:
+        """The choices on offer in menu mode, as they stand in `info["action_schema"].choices`."""
+        return tuple(self._menu.values())
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The map as uint8 (H, W, 3) with `render_mode="rgb_array"`, else None."""
@@ -227,6 +265,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "world": world.snapshot().decode("utf-8"),
             "steps": self._steps,
             "last": self._last.dump(),
+            "page": self._page,
+            "plan": self._plan,
             "track": self._track,
             "thought": self._thought,
         }
@@ -243,6 +283,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             version, seed = state["version"], state["seed"]
             blob, steps, last, track = state["world"].encode("utf-8"), state["steps"], state["last"], state["track"]
             thought = None if state["thought"] is None else tuple(state["thought"])
+            page, plan = state["page"], state["plan"]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"these bytes are no snapshot of a DeliveryBench environment ({error!r})") from error
         if version != SNAPSHOT_VERSION:
@@ -251,8 +292,13 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             self._world = World(self.city, self.rules, seed, self.shift_hours)
             self._cards = OfferCards(self._world.book)
         self._world.restore(blob)
-        self._steps, self._last, self._track, self._thought = steps, _Last(**last), track, thought
+        self._steps, self._last, self._track, self._thought = steps, Last(**last), track, thought
+        self._page, self._plan = page, plan
         self._menu = self._options(describe(self._world, self._cards)) if self.menu_mode else {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        blob = None if self._world is None else self.snapshot()
+        return _revived, (type(self), self._arguments, self._np_random, self._np_random_seed, blob)
 
     # -- internals ---------------------------------------------------------------------------------------------
 
@@ -262,12 +308,27 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
 
     @property
     def _truncated(self) -> bool:
-        state = self.world.state
-        out_of_steps = self.max_steps is not None and self._steps >= self.max_steps
-        return not self._terminated and (state.ended or out_of_steps)
+        return not self._terminated and (self.world.state.ended or self._out_of_steps)
+
+    @property
+    def _out_of_steps(self) -> bool:
+        return self._steps >= (self.max_steps or STEP_LIMIT)
 
     def _options(self, view: Mapping[str, Any]) -> dict[str, Option]:
-        return {option.text: option for option in options(view)} if self.menu_mode else {}
+        if not self.menu_mode:
+            return {}
+        found = pages(view)
+        return {option.text: option for option in found[self._page % len(found)]}
+
+    def _text(self, view: Mapping[str, Any]) -> str:
+        last = self._last
+        if self.compact and self.menu_mode:
+            # The menu shows what a success led to; only failures and payments need words.
+            said = last.error or (last.message if "delivered" in last.events else "")
+            return menu_text(view, said, self.menu)
+        if self.compact:
+            return compact_text(view, last.message)
+        return full_text(view, around(self.city, self.world.state.position, view), self._plan, self.menu)
 
     def _native(self, text: str) -> tuple[str, str]:
         """The native call for an answer, and in menu mode the problem with an answer that is neither."""
@@ -282,14 +343,18 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         chosen: Option | None = self._menu.get(action.name)
         return (text, "") if chosen is None else (chosen.call, "")
 
-    def _info(self, view: dict[str, Any], schema: ActionSchema) -> dict[str, Any]:
-        world, last = self.world, self._last
+    def _info(self, view: dict[str, Any], schema: ActionSchema, last: Last) -> dict[str, Any]:
+        world = self.world
         earned = world.state.balance - self.rules.initial_balance
+        cut = self._truncated and not world.state.ended
+        hours = max(SHORTEST_PLAYED_H, world.seconds / 3600.0) if cut else self.shift_hours
         metrics: dict[str, Any] = {
             "net_earnings": earned,
             "deliveries": len(world.state.settlements),
             "clock_s": view["clock_s"],
-            "hourly_profit": earned / self.shift_hours,
+            "hourly_profit": earned / hours,
+            "hours_paid": hours,
+            "cut": cut,
             "rules": self.rules.name,
         }
         info: dict[str, Any] = {
@@ -311,7 +376,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             "state_hash": state_hash(view),
         }
         if self._terminated or self._truncated:
-            report = world.summary()
+            report = world.summary(hours if cut else None)
             metrics.update(report["evaluation"])
             info["report"] = report
         return info
@@ -322,52 +387,15 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         return render(self.world, [(str(mode), (float(x), float(y))) for mode, x, y in self._track])
 
 
-class _Last:
-    """What the last step left for the next observation."""
-
-    __slots__ = ("call", "code", "error", "events", "invalid", "message", "seconds", "thought")
-
-    def __init__(
-        self,
-        call: str = "",
-        code: str = "",
-        error: str = "",
-        message: str = "",
-        invalid: bool = False,
-        seconds: float = 0.0,
-        events: list[str] | None = None,
-        thought: tuple[int, int] = (0, 0),
-    ) -> None:
-        self.call = call
-        self.code = code
-        self.error = error
-        self.message = message
-        self.invalid = invalid
-        self.seconds = seconds
-        self.events = events or []
-        self.thought = thought
-
-    @classmethod
-    def of(cls, outcome: Outcome, call: str, problem: str, events: list[str], thought: tuple[int, int]) -> _Last:
-        """From a step's outcome; `problem` replaces the message of an answer that is no choice of the menu."""
-        message = problem or outcome.message
-        for settled in outcome.settlements:
-            message += f": {settled.stars} stars, ${settled.paid:.2f}"
-        failed = outcome.ok is False
-        return cls(
-            call=call[:MAX_ACTION],
-            code=outcome.code,
-            error=message if failed else "",
-            message=f"failed: {message}" if failed else message,
-            invalid=failed,
-            seconds=outcome.seconds,
-            events=events,
-            thought=thought,
-        )
-
-    def dump(self) -> dict[str, Any]:
-        """The constructor's arguments as JSON values."""
-        return {name: getattr(self, name) for name in self.__slots__}
+def _revived(
+    kind: type[DeliveryBenchEnv], arguments: dict[str, Any], rng: Any, rng_seed: int | None, blob: bytes | None
+) -> DeliveryBenchEnv:
+    """A copied or unpickled environment."""
+    env = kind(**arguments)
+    env._np_random, env._np_random_seed = rng, rng_seed
+    if blob is not None:
+        env.restore(blob)
+    return env
 
 
 def _adapted(rules: Rules, max_steps: int | None, start_battery: float | None) -> Rules:

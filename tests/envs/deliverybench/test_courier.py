@@ -204,3 +204,17 @@ def test_courier_state_survives_a_snapshot() -> None:
     drawn = [dice.act(info) for _ in range(5)]
     dice.restore(blob)
     assert [dice.act(info) for _ in range(5)] == drawn
+
+
+def test_the_courier_never_sleeps_beside_open_offers() -> None:
+    """With two of sixty steps left nothing can be delivered; the rest of the shift used to be waited away at once."""
+    env = DeliveryBenchEnv(size="tiny", city_seed=0, max_steps=60)
+    _, info = env.reset(seed=1)
+    courier, ended, waits = RuleBasedCourier(env.city), False, []
+    while not ended:
+        action = courier.act(info)
+        if action.startswith("WAIT(") and not info["state"]["orders"]:
+            waits.append(float(action[5:-1]))
+        _, _, terminated, truncated, info = env.step(action)
+        ended = terminated or truncated
+    assert truncated and len(info["state"]["offers"]) == 10 and waits and max(waits) <= 60.0

@@ -60,6 +60,7 @@ def test_speed_benchmark_generates_a_city_where_no_map_is(tmp_path: Path, monkey
 
 def test_speed_benchmark_has_its_figures(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(deliverybench, "STEPS", 200)
+    monkeypatch.setattr(deliverybench, "ENVIRONMENTS", 4)
     folder = write_city(tmp_path / "tiny-0", "tiny", 0)
     deliverybench.main(["--json", "--map", str(folder), "--shifts", "1", "--repeats", "1"])
     result = json.loads(capsys.readouterr().out)

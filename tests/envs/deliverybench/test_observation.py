@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 
 import pytest
 
 from agentspec.envs.deliverybench.city.generate import generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.view.cards import OfferCards, describe
-from agentspec.envs.deliverybench.view.observation import around, compact_text, full_text, instruction, surroundings
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe, metres
+from agentspec.envs.deliverybench.view.compact import compact_text
+from agentspec.envs.deliverybench.view.full import around, full_text, surroundings
+from agentspec.envs.deliverybench.view.hints import hints
+from agentspec.envs.deliverybench.view.instruction import instruction
 from agentspec.envs.deliverybench.world.engine import World
+from agentspec.envs.deliverybench.world.grammar import advertised, schema_for
+from agentspec.envs.deliverybench.world.notes import METHODS
 from agentspec.envs.deliverybench.world.rules import rules_named
 
 
@@ -31,8 +39,8 @@ def test_view_is_json_and_in_metres_and_dollars() -> None:
     assert order["ready_in_s"] == float(offer.prep) and order["time_left_s"] == round(offer.limit, 1)
     assert view["battery"] == 50.0 and view["range_m"] == 1250.0  # 50 % at 0.04 % per metre
     assert [o["id"] for o in view["offers"]] == world.state.pool and 0 not in world.state.pool
-    # The allowed methods are not told; the note is.
-    assert "methods" not in order and order["note"] == offer.note
+    # The note is told at once; which methods it allows only at the customer's.
+    assert order["methods"] == [] and order["note"] == offer.note
 
 
 def test_view_follows_an_order() -> None:
@@ -79,7 +87,7 @@ def test_instruction_is_static_and_free_of_the_answer_format() -> None:
 @pytest.mark.parametrize("menu", [False, True])
 def test_compact_instruction_is_short(menu: bool) -> None:
     text = instruction(generate("large", 0), rules_named("fair"), 1.0, compact=True, menu=menu)
-    assert len(text) < (500 if menu else 1500)
+    assert len(text) < (800 if menu else 2200)
 
 
 def test_full_text_has_its_sections_in_order() -> None:
@@ -137,7 +145,7 @@ def test_late_orders_and_charging_are_shown() -> None:
     world.step("CHARGE(target_pct=80)")
     view = describe(world, cards)
     assert view["mode"] == "walk" and "charging to 80 %" in full_text(view, "")
-    assert "charging" in compact_text(view, "", ())
+    assert "charging" in compact_text(view, "")
 
 
 def test_compact_text_stays_short_throughout_an_episode() -> None:
@@ -148,6 +156,167 @@ def test_compact_text_stays_short_throughout_an_episode() -> None:
     courier = RandomCourier()
     ended = False
     while not ended:
-        assert len(observation["text"]) <= 700
+        assert len(observation["text"]) <= 1000
         observation, _, terminated, truncated, info = env.step(courier.act(info))
         ended = terminated or truncated
+
+
+def placed(world: World, point: tuple[float, float], dx: float = 0.0) -> None:
+    """Put the courier beside a point (cm)."""
+    world.state.position = (point[0] + dx, point[1])
+
+
+def test_what_is_in_reach_is_here_and_nothing_else_is() -> None:
+    """456 of 456 places in reach used to be shown as 8 to 16 m away."""
+    city = generate("small", 0)
+    world = World(city, seed=0)
+    cards, kinds = OfferCards(world.book), ("charging_station", "store", "rest_area", "car_rental", "bus_station")
+    for poi in (poi for kind in kinds for poi in city.pois_of(kind)):
+        # 3 m beside it, within the 5 m that are in reach though the way along the street is longer; and 30 m beside it.
+        for dx, here in ((300.0, True), (3000.0, False)):
+            placed(world, poi.anchor, dx)
+            view = describe(world, cards)
+            view["nearest"] = {poi.kind: {"name": poi.name, "xy": metres(poi.anchor), "m": 12}}
+            x, y = metres(poi.anchor)
+            text = around(city, world.state.position, view)
+            assert f"{poi.name} ({x:.1f}m, {y:.1f}m) {'here' if here else '12m'}" in text
+
+
+def test_orders_in_reach_are_here_in_both_texts() -> None:
+    world, cards = fresh()
+    world.step("ACCEPT_ORDER([0])")
+    placed(world, world.book[0].pickup.anchor, 300.0)
+    view = describe(world, cards)
+    assert view["orders"][0]["to_pickup_m"] > 3 and "(here), from there" in full_text(view, "")
+    assert re.search(r"order 0: .* here, ", compact_text(view, ""))
+
+
+def test_accepted_orders_keep_their_details_and_temperatures() -> None:
+    world, cards = fresh()
+    world.step("VIEW_ORDERS()")
+    number = next(n for n in world.state.pool if world.book[n].note)
+    offer = world.book[number]
+    world.step(f"ACCEPT_ORDER([{number}])")
+    text, short = (full_text(describe(world, cards), ""), compact_text(describe(world, cards), ""))
+    for shown in (text, short):
+        assert f'"{offer.note}"' in shown and f"{offer.distance / 100:.0f}m" in shown and f"${offer.pay:.2f}" in shown
+        assert all(f"{food.name} {food.serving:.0f}C" in shown for food in offer.foods)
+    placed(world, offer.pickup.anchor)
+    world.step(f"WAIT({offer.prep + 300})")
+    world.step(f"PICKUP(orders=[{number}])")
+    view = describe(world, cards)
+    for i, dish in enumerate(view["orders"][0]["dishes"], start=1):
+        # 300 s on the counter at 22 C: the excess over it shrinks by exp(-300 / 1800).
+        expected = 22.0 + (dish["serve"] - 22.0) * math.exp(-300.0 / 1800.0)
+        assert dish["temp"] == pytest.approx(expected, abs=0.06)
+        assert f"{i} {dish['name']} {dish['temp']:.0f}C" in full_text(view, "")
+        assert f"{dish['name']} {dish['temp']:.0f}/{dish['serve']:.0f}C" in compact_text(view, "")
+
+
+def test_what_is_in_the_bag_says_whose_it_is() -> None:
+    world, cards = fresh()
+    collect_all(world, 0)
+    world.step('PLACE_FOOD_IN_BAG(bag_cmd="order 0: 1 -> C")')
+    assert re.search(r"C\.1 \w+ -?\d+C \(order 0\)", full_text(describe(world, cards), ""))
+
+
+def collect_all(world: World, *numbers: int) -> None:
+    world.step(f"ACCEPT_ORDER({list(numbers)})")
+    world.step("WAIT(420)")
+    for number in numbers:
+        placed(world, world.book[number].pickup.anchor)
+        world.step(f"PICKUP(orders=[{number}])")
+
+
+def test_hints_can_be_carried_out_as_they_stand() -> None:
+    """Every complete call in a hint succeeds where the hint is given."""
+    tried: dict[str, int] = {}
+    env = DeliveryBenchEnv(size="small", city_seed=1)
+    _, info = env.reset(seed=3)
+    courier = RuleBasedCourier(env.city)
+    for _ in range(120):
+        for hint in hints(info["state"]):
+            for call in re.findall(r"\b[A-Z_]{4,}\((?:[^()\"]|\"[^\"]*\")*\)", hint):
+                assert "..." not in call
+                blob = env.snapshot()
+                told = env.step(call)[4]
+                assert not told["invalid"], (hint, told["error"])
+                tried[call.partition("(")[0]] = tried.get(call.partition("(")[0], 0) + 1
+                env.restore(blob)
+        *_, info = env.step(courier.act(info))
+    assert {"PICKUP", "PLACE_FOOD_IN_BAG", "DROP_OFF"} <= set(tried) and sum(tried.values()) > 60
+
+
+def test_hints_tell_the_wanted_hand_over() -> None:
+    for rules in ("fair", "original"):
+        world, cards = fresh(rules=rules)
+        number = next(n for n in range(300) if world.book[n].methods == ("knock",))
+        world.state.pool[0] = number
+        collect_all(world, number)
+        placed(world, world.book[number].dropoff.anchor)
+        (hint,) = [line for line in hints(describe(world, cards)) if line.startswith("deliver")]
+        if rules == "fair":
+            assert f'DROP_OFF(oid={number}, method="knock"); the note asks for knock' in hint
+        else:
+            assert all(method in hint for method in METHODS) and world.book[number].note in hint
+
+
+def test_hints_of_services() -> None:
+    world, cards = fresh()
+
+    def told(kind: str) -> str:
+        placed(world, world.city.pois_of(kind)[0].anchor)
+        return " | ".join(hints(describe(world, cards)))
+
+    # 50 % at 7.5 %/min and 0.05 $/%: 400 s are 7 minutes, rounded.
+    assert "CHARGE(target_pct=100) takes 7 min and costs $2.50" in told("charging_station")
+    assert 'BUY(item_id="energy_drink", qty=1), or escooter_battery_pack, ice_pack or heat_pack' in told("store")
+    assert "RENT_CAR()" in told("car_rental") and "RETURN_CAR()" not in told("car_rental")
+    assert "REST" not in told("rest_area")  # nothing to rest from
+    world.state.energy = 25.0
+    assert "REST(target_pct=100) takes 10 min" in told("rest_area")
+    world.step("RENT_CAR()")
+    placed(world, world.timetable.stops[0])
+    assert "bus" in " ".join(hints(describe(world, cards)))
+
+
+def test_values_of_all_parameters_are_told() -> None:
+    """What a parameter may be stands in the description of its action, not only in the schema."""
+    for spec in advertised(schema_for(rules_named("fair"))).actions.values():
+        for parameter in spec.parameters.values():
+            for value in parameter.enum:
+                assert value in spec.description, (spec.name, value)
+    assert "escooter_battery_pack" in schema_for(rules_named("fair")).actions["BUY"].description
+
+
+def test_rules_against_wasted_steps_are_told() -> None:
+    for compact in (False, True):
+        text = instruction(generate("tiny", 0), rules_named("fair"), 1.0, compact=compact, menu=False)
+        assert "do not look again while they are shown (that costs 10s)" in text
+        assert "Do not repeat an action that has just failed" in text and "finish what you accepted" in text
+        assert "plan" in text
+    assert "10s" not in instruction(generate("tiny", 0), rules_named("original"), 1.0, compact=False, menu=False)
+
+
+def test_a_plan_is_shown_again() -> None:
+    env = DeliveryBenchEnv(size="tiny")
+    env.reset(seed=0)
+    observation, *_, info = env.step('{"action": "VIEW_BAG()", "plan": "Accept 3,\\nthen ride."}')
+    assert not info["invalid"] and "Your plan: Accept 3, then ride." in observation["text"]
+    blob = env.snapshot()
+    observation, *_ = env.step("WAIT(1)")
+    assert "Your plan: Accept 3, then ride." in observation["text"]
+    observation, *_ = env.step('```json\n{"action": "WAIT(1)", "future_plan": "rest"}\n```')
+    assert "Your plan: rest" in observation["text"]
+    env.restore(blob)
+    assert "Your plan: Accept 3, then ride." in env.observe()[0]["text"]
+    assert "Your plan" not in env.reset(seed=0)[0]["text"]
+
+
+def test_full_text_with_a_menu_says_each_thing_once() -> None:
+    env = DeliveryBenchEnv(size="tiny", action_mode="menu")
+    observation, info = env.reset(seed=0)
+    text = observation["text"]
+    assert "Here you can" not in text and "VIEW_ORDERS" not in text and "- order 9: $" in text
+    assert all(f"- {choice}" in text for choice in info["action_schema"].choices)
+    assert not any(line.startswith("- accept order") and "$" in line for line in text.splitlines())

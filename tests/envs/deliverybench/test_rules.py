@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import pytest
 
+from agentspec.envs.deliverybench.view.cards import OfferCards, describe
 from agentspec.envs.deliverybench.world.bag import Item
 from agentspec.envs.deliverybench.world.engine import World
 from agentspec.envs.deliverybench.world.food import COLD, HOT, MENU
@@ -369,6 +370,30 @@ def test_quirk_views_after_parse_errors() -> None:
             refuse(w, "hm", "PARSE_NOT_CALL")
         assert (w.recorder.successes["VIEW_ORDERS"] == 1) == (rules == "original")
         assert ("orders" in [notice.kind for notice in w.state.notices]) == (rules == "original")
+
+
+def test_quirk_free_looks() -> None:
+    for rules in BOTH:
+        w = world(rules)
+        for look in ("VIEW_ORDERS()", "VIEW_BAG()", "VIEW_BUS_SCHEDULE()", "VIEW_HELP_BOARD()"):
+            assert do(w, look).seconds == 0.0
+            # A second look at what is shown anyway costs ten seconds, so nobody can look for ever at clock 0.
+            assert do(w, look).seconds == (0.0 if rules == "original" else 10.0)
+        do(w, "ACCEPT_ORDER([0])")
+        assert do(w, "VIEW_ORDERS()").seconds == 0.0
+
+
+def test_quirk_methods_hidden() -> None:
+    for rules in BOTH:
+        w = world(rules, seed=3)
+        number = next(n for n in range(200) if w.book[n].methods)
+        w.state.pool[0] = number
+        collect(w, number)
+        cards = OfferCards(w.book)
+        assert describe(w, cards)["orders"][0]["methods"] == []
+        w.state.position = w.book[number].dropoff.anchor
+        told = describe(w, cards)["orders"][0]["methods"]
+        assert told == (list(w.book[number].methods) if rules == "fair" else [])
 
 
 def test_quirk_last_call_is_cut() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agentspec.envs.deliverybench.world.engine import HANDLERS, World
-from agentspec.envs.deliverybench.world.grammar import schema_for
+from agentspec.envs.deliverybench.world.grammar import SOCIAL, advertised, schema_for
 from agentspec.envs.deliverybench.world.rules import FAIR, ORIGINAL
 from agentspec.types import Action
 from tests.envs.deliverybench.fuzz import sensible_text
@@ -224,6 +224,32 @@ def test_social_actions_with_one_courier() -> None:
     do(w, 'POST_HELP(kind="help_buy")')
     refuse(w, "POST_HELP()", "HELP_KIND")
     refuse(w, "ACCEPT_HELP(1)", "HELP_ALONE")
+
+
+def test_an_own_request_for_help_can_be_changed() -> None:
+    w = world("original")
+    do(w, 'POST_HELP(kind="HELP_DELIVERY", order_id=3, bounty=2)')
+    do(w, 'POST_HELP(kind="HELP_BUY")')
+    do(w, "EDIT_HELP(req_id=1, new_bounty=5)")
+    do(w, "EDIT_HELP(req_id=2, new_ttl=600)")
+    assert [(r.id, r.kind, r.bounty, r.seconds) for r in w.state.requests] == [
+        (1, "HELP_DELIVERY", 5.0, None),
+        (2, "HELP_BUY", 0.0, 600.0),
+    ]
+    refuse(w, "EDIT_HELP(req_id=3, new_bounty=5)", "HELP_UNKNOWN")
+    refuse(w, "EDIT_HELP(req_id=1)", "HELP_NO_CHANGE")
+    refuse(w, "EDIT_HELP(req_id=1, new_bounty=-1)", "PARSE_ARGS")
+    blob = w.snapshot()
+    do(w, "EDIT_HELP(1, new_bounty=9)")
+    w.restore(blob)
+    assert w.state.requests[0].bounty == 5.0 and w.state.balance == 100.0
+
+
+def test_social_actions_are_not_advertised_to_a_lone_courier_but_work() -> None:
+    schema = world("fair").schema
+    shown = advertised(schema)
+    assert set(schema.actions) - set(shown.actions) == set(SOCIAL) and "SAY" in SOCIAL
+    assert {"MOVE", "DROP_OFF", "BOARD_BUS"} <= set(shown.actions)
 
 
 def test_worlds_of_a_city_share_nothing_that_changes() -> None:

@@ -105,6 +105,10 @@ class City:
     def __repr__(self) -> str:
         return f"City({self.name!r}, {len(self.roads)} roads, {len(self.pois)} places)"
 
+    def __deepcopy__(self, memo: object) -> City:
+        """Itself: a city never changes, and copies of a world share it."""
+        return self
+
     # -- places ------------------------------------------------------------------------------------------------
 
     def poi(self, key: str) -> Poi:

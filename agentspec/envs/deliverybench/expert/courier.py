@@ -21,16 +21,16 @@ from agentspec.envs.deliverybench.city.citymap import City
 from agentspec.envs.deliverybench.city.geometry import polyline_length
 from agentspec.envs.deliverybench.expert import errands
 from agentspec.envs.deliverybench.expert.errands import Upkeep
-from agentspec.envs.deliverybench.expert.planning import PICKUP, Job, Planner, Point, Stop
+from agentspec.envs.deliverybench.expert.matching import match
+from agentspec.envs.deliverybench.expert.planning import Job, Planner, Point, Stop
 from agentspec.envs.deliverybench.view import calls
 from agentspec.envs.deliverybench.view.calls import View, within_reach
 from agentspec.envs.deliverybench.view.cards import IN_BAG, IN_HAND, READY
-from agentspec.envs.deliverybench.view.menu import Option, best_offers, options
+from agentspec.envs.deliverybench.view.menu import MORE, options
 
 MEMO_LIMIT = 100_000
-CHARGING_PAYS_S = 600.0
 PAUSE_S = 10.0
-REST_OF_SHIFT = "WAIT({:.1f})"
+IDLE_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,20 @@ class RuleBasedCourier:
         self.style = style or Style()
         self.round: list[Stop] = []
         self._last = ""
+        self._taken: list[int] = []
         self._memo: tuple[dict[tuple[Point, Point], float], dict[tuple[Point, Point], float]] = ({}, {})
 
     # -- the interface -----------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Forget the round; call at the start of an episode."""
-        self.round, self._last = [], ""
+        self.round, self._last, self._taken = [], "", []
 
     def act(self, info: Mapping[str, Any]) -> str:
         """The next action for `info` of reset or step: one of the menu's texts if there is a menu, else a call."""
         view = info["state"]
         if info["action_schema"].choices:
-            return self.choose(view).text
+            return self.choose(view, info["action_schema"].choices)
         action = self.call(view)
         if action == self._last and view["error"]:
             # What has just been refused is not tried again at once.
@@ -87,29 +88,31 @@ class RuleBasedCourier:
         return action
 
     def snapshot(self) -> bytes:
-        """The round and the last action, for `restore`."""
-        return json.dumps([self._last, [[s.job, s.kind, list(s.place)] for s in self.round]]).encode()
+        """The round, the last action and the offers still to accept, for `restore`."""
+        return json.dumps([self._last, self._taken, [[s.job, s.kind, list(s.place)] for s in self.round]]).encode()
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`."""
-        self._last, stops = json.loads(blob)
+        self._last, self._taken, stops = json.loads(blob)
         self.round = [Stop(job, kind, (place[0], place[1])) for job, kind, place in stops]
 
     # -- native actions ----------------------------------------------------------------------------------------
 
-    def call(self, view: View) -> str:
-        """The next native call."""
+    def call(self, view: View, menu: bool = False) -> str:
+        """The next native call; from a `menu` offers are accepted one at a time, which costs actions."""
         style = self.style
+        self._taken = []
         action = self._at_hand(view) or errands.refresh(view, style.upkeep) or self._mount(view)
         if action is not None:
             return action
         car = errands.wants_car(view, style.upkeep)
         start, planner = self._planner(view, car)
+        planner.per_offer = int(menu)
         active = [self._job(order) for order in view["orders"]]
         _, self.round = planner.build(start, active, self.round)
-        taken = self._take(view, planner, start)
-        if taken:
-            return calls.accept(taken)
+        self._taken = self._take(view, planner, start)
+        if self._taken:
+            return calls.accept(self._taken)
         if car and self.round:
             return errands.fetch_car(view)
         return self._go_on(view)
@@ -154,7 +157,7 @@ class RuleBasedCourier:
         upkeep = self.style.upkeep
         if not self.round:
             errand = errands.shopping(view, upkeep, None, 0.0) or errands.close_car(view)
-            return errand or REST_OF_SHIFT.format(max(1.0, view["left_s"]))
+            return errand or calls.wait(self._idle(view))
         goal = self.round[0].place
         leg = self._metres(view["mode"] == "car", _point(view["position"]), goal)
         errand = errands.shopping(view, upkeep, goal, leg) or errands.power(view, leg)
@@ -165,16 +168,14 @@ class RuleBasedCourier:
             return calls.wait(max(1.0, order["ready_in_s"]))
         return calls.move(goal, self._pace(view))
 
+    def _idle(self, view: View) -> float:
+        """Seconds to wait where no order is worth taking: to the end of the shift; a minute where actions are limited,
+        because the episode ends with them and not with the shift."""
+        left = max(1.0, view["left_s"])
+        return left if view["calls_left"] is None else min(left, IDLE_S)
+
     def _pace(self, view: View) -> str:
-        if not self.style.hasty:
-            return "normal"
-        fragile = any(
-            calls.FOODS[name].fragile
-            for order in view["orders"]
-            if order["status"] in (IN_BAG, IN_HAND)
-            for name in order["items"]
-        )
-        return "normal" if fragile else "accel"
+        return "normal" if not self.style.hasty or calls.fragile_carried(view) else "accel"
 
     # -- planning ----------------------------------------------------------------------------------------------
 
@@ -238,43 +239,24 @@ class RuleBasedCourier:
 
     # -- the menu ----------------------------------------------------------------------------------------------
 
-    def choose(self, view: View) -> Option:
-        """The next option of the menu."""
-        menu = {option.text: option for option in options(view)}
-        start, planner = self._planner(view, car=False)
-        planner.per_offer = 1
-        _, self.round = planner.build(start, [self._job(order) for order in view["orders"]], self.round)
-        for text in self._wishes(view, planner, start, menu):
-            if text in menu:
-                return menu[text]
-        return next(reversed(menu.values()))
+    def choose(self, view: View, shown: Sequence[str]) -> str:
+        """The choice of the menu that stands for the next native call; `MORE` where it is on another page.
 
-    def _wishes(self, view: View, planner: Planner, start: Point, menu: Mapping[str, Option]) -> list[str]:
-        """Option texts in order of preference."""
-        first = [text for text in menu if text.startswith(("deliver", "bag", "pick up", "use", "rest to"))]
-        if view["charging"] is not None:
-            first.append("wait for charging")
-        first += ["charge to 80%", "ride scooter"]
-        offered = [offer for offer in best_offers(view) if f"accept order {offer['id']}" in menu]
-        taken = self._choose(planner, start, offered, len(offered)) if offered else []
-        first += [f"accept order {number}" for number in taken[:1]]
-        if view["mode"] != "car" and view["range_m"] < self._range_needed(start, view["left_s"]) + 30.0:
-            first.append("go to charger")
-        for stop in self.round:
-            place = "pickup" if stop.kind == PICKUP else "drop-off"
-            first += [f"go to {place} of order {stop.job}", f"wait for order {stop.job}"]
-        return [*first, "go to scooter", "go to rest area"]
-
-    def _range_needed(self, start: Point, left_s: float) -> float:
-        """Metres to the next stop of the round, and from there to a charger while charging can still pay."""
-        if not self.round:
-            return 0.0
-        goal = self.round[0].place
-        leg = self._metres(False, start, goal)
-        station = self.city.nearest("charging_station", (goal[0] * 100.0, goal[1] * 100.0))
-        if station is None or left_s < CHARGING_PAYS_S:
-            return leg
-        return leg + self._metres(False, goal, _metres_of(station[0].anchor))
+        Offers that were chosen together are accepted one after the other, without planning anew in between.
+        """
+        known = options(view)
+        offered = {number for option in known if option.kind == "accept" for number in calls.numbers_in(option.call)}
+        view = {**view, "offers": [offer for offer in view["offers"] if offer["id"] in offered]}
+        self._taken = [number for number in self._taken if number in offered]
+        if self._taken:
+            call = calls.accept(self._taken)
+        else:
+            call = self.call(view, menu=True)
+            if call == self._last and view["error"]:
+                call = calls.wait(PAUSE_S)
+        self._last = call
+        wanted = match(call, known, self._taken)
+        return wanted if wanted in shown or MORE.text not in shown else MORE.text
 
 
 class RandomCourier:

@@ -7,6 +7,7 @@ the scripted expert write the same call for the same purpose.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,8 @@ from agentspec.envs.deliverybench.world.packing import HOME
 
 View = Mapping[str, Any]
 Card = Mapping[str, Any]
+
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 REACH_M = 5.0
 """How near one must stand to pick up, deliver, charge, shop or rest (metres)."""
@@ -43,6 +46,17 @@ def within_reach(view: View, xy: Sequence[float]) -> bool:
 def hands_full(view: View) -> bool:
     """Whether picked-up food is not in the bag yet."""
     return any(order["hand"] for order in view["orders"])
+
+
+def fragile_carried(view: View) -> bool:
+    """Whether dishes are carried that a hasty move damages."""
+    carried = (order for order in view["orders"] if order["picked"])
+    return any(FOODS[name].fragile for order in carried for name in order["items"])
+
+
+def numbers_in(call: str) -> list[float]:
+    """The numbers in a call, in order."""
+    return [float(number) for number in _NUMBER.findall(call)]
 
 
 def move(xy: Sequence[float], pace: str = "normal") -> str:

@@ -3,8 +3,8 @@
 `describe` turns a world into one JSON-like dict, in **metres**, seconds, percent and dollars. The observation text, the
 menu, the scripted couriers and `info["state"]` are all made from it and from nothing else, so none of them sees more
 than the others. The orders on offer are always in it: looking at them (VIEW_ORDERS) takes no time in the world. What is
-hidden in the world stays hidden: which hand-over methods a note allows must be read from the note, and when an offer's
-food would be ready from what it contains.
+hidden in the world stays hidden: when an offer's food would be ready must be concluded from what it contains, and which
+hand-over methods a note allows from the note (at the customer's they are told, unless the rules hide them).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 
 from agentspec.envs.deliverybench.city.citymap import Poi
 from agentspec.envs.deliverybench.city.routing import DistanceField
-from agentspec.envs.deliverybench.world.bus import BusPhase
 from agentspec.envs.deliverybench.world.engine import World
+from agentspec.envs.deliverybench.world.notes import METHODS
 from agentspec.envs.deliverybench.world.orders import Offer, OrderBook
 from agentspec.envs.deliverybench.world.state import OrderState, State
 
@@ -81,7 +81,11 @@ def describe(world: World, cards: OfferCards) -> dict[str, Any]:
         "hands_must_be_free": not rules.ride_with_food_in_hand,
         "bag": _bag(state),
         "nearest": _nearest(world, field),
-        "bus": _bus(world.timetable.phase(state.tick), clock),
+        "bus": _bus(world, clock),
+        "prices": dict(rules.prices),
+        "charge_per_min": rules.charge_per_min,
+        "charge_price": rules.charge_price,
+        "rest_per_min": rules.rest_per_min,
         "recent": list(state.recent),
         "error": state.error,
         "notices": [{"kind": notice.kind, "text": notice.text} for notice in state.notices],
@@ -147,7 +151,25 @@ def _order(world: World, order: OrderState, cards: OfferCards, field: DistanceFi
         "to_dropoff_m": way(field, offer.dropoff),
         "handoff_xy": None if rules.handoff_hidden or offer.handoff is None else metres(offer.handoff),
         "hand": [item.name for item in order.pending],
+        "picked": order.picked is not None,
+        "dishes": [
+            {"name": item.name, "serve": item.food.serving, "temp": round(item.temp, 1)}
+            for item in order.items
+            if item.food is not None
+        ]
+        or [{"name": food.name, "serve": food.serving, "temp": None} for food in offer.foods],
+        "methods": _methods(world, order),
     }
+
+
+def _methods(world: World, order: OrderState) -> list[str]:
+    """The hand-over methods the customer is content with, told to a courier who has come with the food; else empty."""
+    offer, rules, here = order.offer, world.rules, world.state.position
+    if order.picked is None or rules.methods_hidden:
+        return []
+    places = [offer.dropoff.anchor] + ([] if offer.handoff is None else [offer.handoff])
+    arrived = any(math.dist(place, here) <= rules.nearby for place in places)
+    return list(offer.methods or METHODS) if arrived else []
 
 
 def _status(order: OrderState, ready_in: float) -> str:
@@ -199,8 +221,21 @@ def _nearest(world: World, field: DistanceField) -> dict[str, Any]:
     return {kind: {**card} for kind, card in known.items()}
 
 
-def _bus(phase: BusPhase | None, clock: float) -> dict[str, Any] | None:
+def _bus(world: World, clock: float) -> dict[str, Any] | None:
+    """What the bus does, its stops, and at a stop (`here`) the seconds until it stands there."""
+    timetable, state, rules = world.timetable, world.state, world.rules
+    phase = timetable.phase(state.tick)
     if phase is None:
         return None
-    left = round(max(0.0, phase.until - clock), 1)
-    return {"stopped": phase.stopped, "stop": phase.stop, "target": phase.target, "left_s": left}
+    stops = zip(timetable.names, timetable.stops, strict=True)
+    here = next((name for name, stop in stops if math.dist(stop, state.position) <= rules.bus_tolerance), "")
+    wait = (timetable.arrival(here, state.tick) - state.tick) / rules.ticks_per_second if here else None
+    return {
+        "stopped": phase.stopped,
+        "stop": phase.stop,
+        "target": phase.target,
+        "left_s": round(max(0.0, phase.until - clock), 1),
+        "stops": list(timetable.names),
+        "here": here,
+        "here_s": wait,
+    }

@@ -1,125 +1,115 @@
-"""The menu: the few concrete actions that make sense now, as short stable texts.
+"""The menu: the concrete actions that make sense now, as short stable texts, best first and a page at a time.
 
 A small model cannot write `MOVE(120.5m, -48m)` from nothing, but it can learn *what to do next*. In menu mode the
-environment offers at most ten choices, each a text such as "pick up order 3" and each standing for exactly one native
-call that succeeds now. The texts share their beginnings, so that decoding token by token branches in few places, and no
-two of one menu are equal.
-
-Only three offers, those that pay best for their way, can be accepted, and only while fewer than `MAX_ORDERS` are open:
-the menu keeps the choice among orders but not the burden of reading all of them.
+environment shows at most twelve choices, each a text such as "pick up order 3" and each standing for exactly one native
+call that succeeds now. Everything that earns is among them: several orders at once, both paces, car, bus, charging to a
+level, shops and what they sell, rest. What does not fit on the first page stands on the next ones; "more choices" turns
+the page and takes no time. The texts share their beginnings, so that decoding token by token branches in few places,
+and no two of one menu are equal.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-from agentspec.envs.deliverybench.view import calls
-from agentspec.envs.deliverybench.view.calls import Card, View, within_reach
-from agentspec.envs.deliverybench.view.cards import IN_BAG, IN_HAND, PREPARING, READY
+from agentspec.envs.deliverybench.view import calls, choices
+from agentspec.envs.deliverybench.view.calls import View, within_reach
+from agentspec.envs.deliverybench.view.choices import Option
 
-MAX_CHOICES = 10
-MAX_OFFERS = 3
-MAX_ORDERS = 3
-SHORT_WAIT_S = 60.0
-LOW_BATTERY, LOW_ENERGY = 40.0, 40.0
-CHARGE_TARGET, REST_TARGET = 80.0, 80.0
+MAX_CHOICES = 12
+MAX_WAYS, MAX_OFFERS = 5, 4
+"""Ways and offers on the first page, which is kept short; the others follow."""
 
-
-@dataclass(frozen=True, slots=True)
-class Option:
-    """One choice: its text, and the native call it stands for."""
-
-    text: str
-    call: str
-
-
-def best_offers(view: View, count: int = MAX_OFFERS) -> list[Card]:
-    """The offers that pay best per metre of the whole errand (to the restaurant and on), best first.
-
-    Offers that can no longer be delivered before the shift ends are left out.
-    """
-    speed = view["speed"]
-
-    def rate(offer: Card) -> float:
-        return float(offer["pay"] + 2.0) / (offer["to_pickup_m"] + offer["distance_m"] + 100.0)
-
-    def feasible(offer: Card) -> bool:
-        ready = max(offer["to_pickup_m"] / speed, calls.prep_seconds(offer["items"]))
-        return bool(ready + offer["distance_m"] / speed <= view["left_s"])
-
-    offers = [offer for offer in view["offers"] if feasible(offer)]
-    return sorted(offers, key=lambda offer: (-rate(offer), offer["id"]))[:count]
+LOW_BATTERY, LOW_ENERGY, THIRSTY = 40.0, 40.0, 50.0
+CAR_FROM_S, CAR_MONEY = 900.0, 30.0
+MORE = Option("more choices", "", "more")
 
 
 def options(view: View) -> list[Option]:
-    """The menu for this view, at most `MAX_CHOICES` options in a stable order: work first, then offers, then care."""
-    # Food in the hand comes first, and is packed before the courier goes on: no vehicle moves with it (fair rules).
-    orders = sorted(view["orders"], key=lambda order: not order["hand"])
-    found = [option for order in orders[: MAX_ORDERS + 1] for option in _work(view, order)]
-    room = MAX_ORDERS - len(view["orders"])
-    if room > 0 and view["room"] != 0:
-        found += [accept_option(offer["id"]) for offer in best_offers(view)]
-    found += _vehicle(view) + _energy(view)
-    if calls.hands_full(view):
-        found = [option for option in found if not option.call.startswith("MOVE")]
-    found = found[: MAX_CHOICES - 1]
-    found.append(Option("wait 1 minute", calls.wait(SHORT_WAIT_S)))
-    return list({option.text: option for option in found}.values())
+    """All choices, best first."""
+    first, others = _ranked(view)
+    return first + others
 
 
-def accept_option(number: int) -> Option:
-    """Take an offer."""
-    return Option(f"accept order {number}", calls.accept([number]))
+def pages(view: View) -> list[list[Option]]:
+    """The choices in pages of at most `MAX_CHOICES`, each ending with `MORE`; the first is as short as it can be."""
+    first, others = _ranked(view)
+    size = MAX_CHOICES - 1
+    # The short wait closes the first page: it is always there, and always at the end.
+    *rest, wait = first
+    others = rest[size - 1 :] + others
+    page = [*rest[: size - 1], wait, MORE]
+    return [page, *([*others[i : i + size], MORE] for i in range(0, len(others), size))]
 
 
-def _work(view: View, order: Card) -> list[Option]:
-    """The next thing to do for an order."""
-    number, status = order["id"], order["status"]
-    if status in (PREPARING, READY):
-        if not within_reach(view, order["pickup_xy"]):
-            return [Option(f"go to pickup of order {number}", calls.move(order["pickup_xy"]))]
-        if status == READY:
-            return [Option(f"pick up order {number}", calls.pick_up([number]))]
-        return [Option(f"wait for order {number}", calls.wait(order["ready_in_s"]))]
-    found = []
-    if status == IN_HAND:
-        found.append(Option(f"bag order {number}", calls.bag(view, [order])))
-    method, place = calls.handover(order)
-    if within_reach(view, place):
-        found.append(Option(f"deliver order {number} {calls.MANNER[method]}", calls.deliver(order)))
-    elif status == IN_BAG:
-        found.append(Option(f"go to drop-off of order {number}", calls.move(place)))
-    return found
+def _ranked(view: View) -> tuple[list[Option], list[Option]]:
+    """What belongs onto the first page, and the rest; equal texts and calls once."""
+    ways = choices.ways(view)
+    offered = choices.offers(view)
+    care, later = _care(view)
+    rent = _car_pays(view)
+    cars = choices.car(view)
+    waits = choices.waits(view)
+    first = [
+        *choices.work_here(view),
+        *choices.mounts(view),
+        *(cars if rent else ()),
+        *(way for way, _ in ways[:MAX_WAYS]),
+        *offered[:MAX_OFFERS],
+        *care,
+        *([waits[-1]] if not view["orders"] and not offered else ()),
+        waits[0],
+    ]
+    others = [
+        *(way for way, _ in ways[MAX_WAYS:]),
+        *offered[MAX_OFFERS:],
+        *later,
+        *(way for _, way in ways),
+        *cars,
+        *choices.bus(view),
+        *choices.on_foot(view),
+        *waits[1:],
+    ]
+    if calls.hands_full(view) and view["hands_must_be_free"] and view["mode"] != "walk":
+        # No vehicle moves with food in the hand: it is packed before the courier goes on.
+        first, others = _standing(first), _standing(others)
+    unique = {option.text: option for option in reversed(first + others)}
+    keep = [unique.pop(option.text) for option in first if option.text in unique]
+    return keep, [unique.pop(option.text) for option in others if option.text in unique]
 
 
-def _vehicle(view: View) -> list[Option]:
-    """Scooter and battery."""
-    mode, charging = view["mode"], view["charging"]
-    if mode == "walk":
-        near = view["scooter_m"] is not None and view["scooter_m"] <= calls.REACH_M
-        if not near:
-            xy = view["scooter_xy"]
-            return [] if xy is None else [Option("go to scooter", calls.move(xy))]
-        ride = Option("ride scooter", 'SWITCH(to="e-scooter")')
-        return [Option("wait for charging", 'WAIT("charge_done")'), ride] if charging is not None else [ride]
-    station = view["nearest"].get("charging_station")
-    if mode not in ("e-scooter", "drag_scooter") or station is None or view["battery"] > LOW_BATTERY:
-        return []
-    if within_reach(view, station["xy"]):
-        return [Option(f"charge to {CHARGE_TARGET:.0f}%", f"CHARGE(target_pct={CHARGE_TARGET:.0f})")]
-    return [Option("go to charger", calls.move(station["xy"]))]
+def _standing(group: Sequence[Option]) -> list[Option]:
+    return [option for option in group if not option.call.startswith("MOVE")]
 
 
-def _energy(view: View) -> list[Option]:
-    """Drinks and rest."""
-    if view["energy"] > LOW_ENERGY:
-        return []
-    found = []
-    if view["inventory"].get("energy_drink"):
-        found.append(Option("use energy drink", "USE_ENERGY_DRINK()"))
-    area = view["nearest"].get("rest_area")
-    if area is not None and within_reach(view, area["xy"]):
-        found.append(Option(f"rest to {REST_TARGET:.0f}%", f"REST(target_pct={REST_TARGET:.0f})"))
-    elif area is not None:
-        found.append(Option("go to rest area", calls.move(area["xy"])))
-    return found
+def _car_pays(view: View) -> bool:
+    """Whether renting a car is worth a place on the first page."""
+    rental = view["nearest"].get("car_rental")
+    if view["car"] is not None or rental is None or view["balance"] < CAR_MONEY:
+        return False
+    return bool(view["left_s"] - rental["m"] / view["speed"] >= CAR_FROM_S)
+
+
+def _care(view: View) -> tuple[list[Option], list[Option]]:
+    """Battery, energy and shopping: what matters now, and the rest."""
+    now: list[Option] = []
+    later: list[Option] = []
+    scooter = view["mode"] in ("e-scooter", "drag_scooter")
+    low = scooter and view["battery"] <= LOW_BATTERY
+    tired = view["energy"] <= LOW_ENERGY
+    for option in choices.using(view):
+        wanted = view["energy"] <= THIRSTY if "drink" in option.text else low
+        (now if wanted and "into" not in option.text else later).append(option)
+    for group, wanted in ((choices.charging(view), low), (choices.resting(view), tired)):
+        (now if wanted else later).extend(group)
+    store = view["nearest"].get("store")
+    visiting = store is not None and within_reach(view, store["xy"])
+    for option in choices.shopping(view):
+        drink, pack = option.text == "buy energy drink", option.text == "buy battery pack"
+        needed = (drink and view["energy"] + 50.0 * view["inventory"].get(choices.DRINK, 0) < 100.0) or (pack and low)
+        urgent = needed if visiting else (tired or low) and not view["inventory"]
+        (now if urgent else later).append(option)
+    return now, later
+
+
+__all__ = ["MAX_CHOICES", "MORE", "Option", "options", "pages"]

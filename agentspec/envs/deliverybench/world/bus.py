@@ -84,6 +84,10 @@ class BusTimetable:
         if stops:
             self._drive(0, points[0], 0, "", -1)
 
+    def __deepcopy__(self, memo: object) -> BusTimetable:
+        """Itself: a timetable is a function of the clock, and copies of a world share it."""
+        return self
+
     def phase(self, tick: int) -> BusPhase | None:
         """The phase at ``tick``; None for a city without a bus."""
         if not self._phases:

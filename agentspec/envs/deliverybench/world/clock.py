@@ -59,6 +59,19 @@ def pass_time(world: Shift, end: int, *, charge_ends: bool = False) -> bool:
     return False
 
 
+def look(world: Shift, kind: str, text: str) -> None:
+    """Show a notice. Looking once takes no time; looking again at what is shown takes ``Rules.look_seconds``, unless
+    the rules let it pass (``free_looks``): otherwise an agent could look for ever and the shift would never end.
+
+    Raises:
+        ShiftOver: the shift ended meanwhile.
+    """
+    shown = any(notice.kind == kind for notice in world.state.notices)
+    if shown and not world.rules.free_looks:
+        pass_time(world, world.state.tick + math.ceil(world.rules.look_seconds * world.rules.ticks_per_second))
+    world.notify(kind, text)
+
+
 def interruption(world: Shift) -> int:
     """The tick at which a move under way would be interrupted because the rent cannot be paid (far off if never)."""
     state = world.state

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agentspec.actions import parse_action
-from agentspec.envs.deliverybench.world import moving, services, vehicles, work
+from agentspec.envs.deliverybench.world import help, moving, services, vehicles, work
 from agentspec.envs.deliverybench.world.clock import ShiftOver, end_episode, pass_time
 from agentspec.envs.deliverybench.world.grammar import Refused
 from agentspec.envs.deliverybench.world.recorder import evaluate, report
@@ -49,14 +49,14 @@ HANDLERS: dict[str, Handler] = {
     "VIEW_BUS_SCHEDULE": vehicles.view_bus_schedule,
     "TURN_AROUND": moving.turn_around,
     "STEP_FORWARD": moving.step_forward,
-    "SAY": services.say,
-    "VIEW_HELP_BOARD": services.view_help_board,
-    "POST_HELP": services.post_help,
-    "ACCEPT_HELP": services.no_helper,
-    "EDIT_HELP": services.no_helper,
-    "PLACE_TEMP_BOX": services.no_helper,
-    "TAKE_FROM_TEMP_BOX": services.no_helper,
-    "REPORT_HELP_FINISHED": services.no_helper,
+    "SAY": help.say,
+    "VIEW_HELP_BOARD": help.view_help_board,
+    "POST_HELP": help.post_help,
+    "ACCEPT_HELP": help.no_helper,
+    "EDIT_HELP": help.edit_help,
+    "PLACE_TEMP_BOX": help.no_helper,
+    "TAKE_FROM_TEMP_BOX": help.no_helper,
+    "REPORT_HELP_FINISHED": help.no_helper,
 }
 
 
@@ -100,13 +100,9 @@ class World(Shift):
         start, delivered = state.tick, len(state.settlements)
         if state.ended:
             return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
-        state.calls += 1
-        if thought > 0.0:
-            try:
-                pass_time(self, state.tick + math.ceil(thought * self.rules.ticks_per_second - 1e-6))
-            except ShiftOver:
-                message = "the shift ended while you were thinking"
-                return self._outcome(None, "", message, start, delivered, action)
+        if not self._think(thought):
+            message = "the shift ended while you were thinking"
+            return self._outcome(None, "", message, start, delivered, action)
         last = self.max_calls is not None and state.calls >= self.max_calls
         if last and self.rules.last_call_is_cut:
             self.last_tick = min(self.shift_ticks, state.tick + 1)
@@ -118,6 +114,27 @@ class World(Shift):
             end_episode(self, "calls")
             outcome = self._outcome(outcome.ok, outcome.code, outcome.message, start, delivered, action)
         return outcome
+
+    def pause(self, message: str, thought: float = 0.0) -> Outcome:
+        """A call that does nothing in the world (to turn a page of the menu, say): it counts, and thinking passes."""
+        state = self.state
+        start, delivered, action = state.tick, len(state.settlements), Action("", text=message)
+        if state.ended:
+            return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
+        over = not self._think(thought)
+        if not over and self.max_calls is not None and state.calls >= self.max_calls:
+            end_episode(self, "calls")
+        return self._outcome(None if over else True, "", message, start, delivered, action)
+
+    def _think(self, seconds: float) -> bool:
+        """Count a call and let the seconds of deliberation pass; whether the shift goes on."""
+        self.state.calls += 1
+        if seconds > 0.0:
+            try:
+                pass_time(self, self.state.tick + math.ceil(seconds * self.rules.ticks_per_second - 1e-6))
+            except ShiftOver:
+                return False
+        return True
 
     def _perform(self, action: Action, start: int, delivered: int) -> Outcome:
         state = self.state
@@ -165,9 +182,12 @@ class World(Shift):
         settled = tuple(state.settlements[delivered:])
         return Outcome(ok, code, message, seconds, state.ended, state.reason, settled, action)
 
-    def summary(self) -> dict[str, Any]:
-        """Run report and evaluation figures so far (JSON values), with city, rule set and seed they belong to."""
-        result = report(self.look(), self.recorder, self.shift_hours, self.rules.initial_balance)
+    def summary(self, hours_paid: float | None = None) -> dict[str, Any]:
+        """Run report and evaluation figures so far (JSON values), with city, rule set and seed they belong to.
+
+        Figures per hour divide by the shift, or by ``hours_paid`` if the episode was cut before its end.
+        """
+        result = report(self.look(), self.recorder, self.shift_hours, self.rules.initial_balance, hours_paid)
         result["meta"] |= {"city": self.city.name, "rules": self.rules.name, "seed": self.seed}
         return result
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -46,11 +47,11 @@ _ANY, _NUM, _STR, _LIST = (Parameter(kind, required=False) for kind in ("any", "
 _COMP = Parameter("str", enum=("A", "B", "C", "D"))
 
 _SPECS: tuple[ActionSpec, ...] = (
-    _spec("VIEW_ORDERS", "list the orders on offer", "VIEW_ORDERS()"),
+    _spec("VIEW_ORDERS", "show the orders on offer", "VIEW_ORDERS()"),
     _spec("ACCEPT_ORDER", "accept one or several orders by id", "ACCEPT_ORDER([3, 7])", ids=Parameter("any")),
     _spec(
         "MOVE",
-        "travel to a point in the current mode; pace accel is faster but shakes fragile food, decel is slower",
+        "travel to a point in the current mode; pace is normal, accel or decel",
         'MOVE(120.5m, -48m, pace="normal")',
         x=Parameter("float"),
         y=Parameter("float"),
@@ -59,19 +60,22 @@ _SPECS: tuple[ActionSpec, ...] = (
     _spec("PICKUP", "take the ready food of your orders at this restaurant", "PICKUP(orders=[3])", orders=_LIST),
     _spec(
         "PLACE_FOOD_IN_BAG",
-        "put food from your hands into the bag compartments A-D, or move bagged food (A.1 is the first item in A)",
+        "put food from your hands into the bag, whose compartments are A, B, C and D: numbers are the items of the "
+        "order in your hands; A.1 -> B moves the first item of A",
         'PLACE_FOOD_IN_BAG(bag_cmd="order 3: 1,2 -> A; 3 -> B")',
         bag_cmd=Parameter("str"),
     ),
     _spec("VIEW_BAG", "look at temperatures and contents of the bag", "VIEW_BAG()"),
     _spec(
         "DROP_OFF",
-        "deliver an order at its drop-off",
+        f"deliver an order at its drop-off; method is {', '.join(METHODS[:-1])} or {METHODS[-1]}",
         'DROP_OFF(oid=3, method="leave_at_door")',
         oid=Parameter("int"),
         method=Parameter("str", enum=METHODS),
     ),
-    _spec("CHARGE", "charge the scooter at a charging station here", "CHARGE(target_pct=80)", target_pct=_NUM),
+    _spec(
+        "CHARGE", "charge the scooter at a charging station here, to 1-100 %", "CHARGE(target_pct=80)", target_pct=_NUM
+    ),
     _spec(
         "WAIT",
         "wait some seconds, or until charging is done",
@@ -80,10 +84,10 @@ _SPECS: tuple[ActionSpec, ...] = (
         until=_STR,
         duration_s=_NUM,
     ),
-    _spec("REST", "rest at a rest area here until the energy target", "REST(target_pct=100)", target_pct=_NUM),
+    _spec("REST", "rest at a rest area here until that energy, 1-100 %", "REST(target_pct=100)", target_pct=_NUM),
     _spec(
         "BUY",
-        "buy at a store here: energy_drink, escooter_battery_pack, ice_pack, heat_pack",
+        "buy at a store here: energy_drink, escooter_battery_pack, ice_pack or heat_pack",
         'BUY(item_id="energy_drink", qty=1)',
         item_id=_STR,
         qty=_NUM,
@@ -93,11 +97,11 @@ _SPECS: tuple[ActionSpec, ...] = (
     ),
     _spec("USE_ENERGY_DRINK", "drink one: +50 % energy", "USE_ENERGY_DRINK()"),
     _spec("USE_BATTERY_PACK", "fill the scooter's battery, in hand or parked here", "USE_BATTERY_PACK()"),
-    _spec("USE_ICE_PACK", "put an ice pack into a bag compartment", 'USE_ICE_PACK(comp="A")', comp=_COMP),
-    _spec("USE_HEAT_PACK", "put a heat pack into a bag compartment", 'USE_HEAT_PACK(comp="A")', comp=_COMP),
+    _spec("USE_ICE_PACK", "put an ice pack into bag compartment A, B, C or D", 'USE_ICE_PACK(comp="A")', comp=_COMP),
+    _spec("USE_HEAT_PACK", "put a heat pack into bag compartment A, B, C or D", 'USE_HEAT_PACK(comp="A")', comp=_COMP),
     _spec(
         "SWITCH",
-        "change the way of travelling",
+        "change the way of travelling: walk, e-scooter, car or drag_scooter; what you leave stays parked here",
         'SWITCH(to="walk")',
         to=Parameter("str", enum=("walk", "e-scooter", "car", "drag_scooter")),
     ),
@@ -105,7 +109,7 @@ _SPECS: tuple[ActionSpec, ...] = (
     _spec("RETURN_CAR", "give the rented car back at a car rental", "RETURN_CAR()"),
     _spec(
         "BOARD_BUS",
-        "board the bus standing here and ride to a stop",
+        "board the bus standing here and ride to a stop of its line",
         'BOARD_BUS(bus_id="bus_1", target_stop_id="bus_station 2")',
         bus_id=Parameter("str"),
         target_stop_id=Parameter("str"),
@@ -113,7 +117,7 @@ _SPECS: tuple[ActionSpec, ...] = (
     _spec("VIEW_BUS_SCHEDULE", "show where the bus is and its stops", "VIEW_BUS_SCHEDULE()"),
     _spec(
         "TURN_AROUND",
-        "turn by an angle in degrees",
+        "turn by an angle in degrees, left or right",
         'TURN_AROUND(angle=90, direction="right")',
         angle=Parameter("float"),
         direction=Parameter("str", required=False, enum=("left", "right")),
@@ -121,9 +125,18 @@ _SPECS: tuple[ActionSpec, ...] = (
     _spec("STEP_FORWARD", "go one metre straight ahead", "STEP_FORWARD()"),
     _spec("SAY", "say something to everybody or to one courier", 'SAY(text="hello")', text=_STR, to=_STR),
     _spec("VIEW_HELP_BOARD", "show requests for help", "VIEW_HELP_BOARD()"),
-    _spec("POST_HELP", "ask other couriers for help", 'POST_HELP(kind="HELP_DELIVERY", order_id=3)', kind=_STR),
+    _spec(
+        "POST_HELP", "ask other couriers for help", 'POST_HELP(kind="HELP_DELIVERY", order_id=3, bounty=3)', kind=_STR
+    ),
     _spec("ACCEPT_HELP", "accept a request for help", "ACCEPT_HELP(req_id=1)", req_id=_ANY),
-    _spec("EDIT_HELP", "change an own request", "EDIT_HELP(req_id=1, new_bounty=5)", req_id=_ANY),
+    _spec(
+        "EDIT_HELP",
+        "change an own request",
+        "EDIT_HELP(req_id=1, new_bounty=5)",
+        req_id=_ANY,
+        new_bounty=_NUM,
+        new_ttl=_NUM,
+    ),
     _spec("PLACE_TEMP_BOX", "put things for another courier into a box", "PLACE_TEMP_BOX(req_id=1)", req_id=_ANY),
     _spec("TAKE_FROM_TEMP_BOX", "take what another courier left", "TAKE_FROM_TEMP_BOX(req_id=1)", req_id=_ANY),
     _spec("REPORT_HELP_FINISHED", "report a request as done", "REPORT_HELP_FINISHED(req_id=1)", req_id=_ANY),
@@ -140,6 +153,16 @@ ALIASES: Mapping[str, str] = {
 }
 
 
+DEFAULTS: Mapping[tuple[str, str], Any] = {
+    ("MOVE", "pace"): "normal",
+    ("BUY", "qty"): 1,
+    ("TURN_AROUND", "direction"): "left",
+}
+"""What leaving out an argument means."""
+
+_LENGTHS = frozenset({("MOVE", "x"), ("MOVE", "y")})
+
+
 def schema_for(rules: Rules) -> ActionSchema:
     """The action schema of a rule set. Lengths arrive in cm (``12m`` is 1200.0 and 12 is 12 cm) under the quirk
     ``bare_numbers_are_cm``, otherwise in metres (``12m`` and 12 are both 12)."""
@@ -148,7 +171,40 @@ def schema_for(rules: Rules) -> ActionSchema:
 
 @lru_cache(maxsize=2)
 def _schema(centimetres: bool = False) -> ActionSchema:
-    return ActionSchema({spec.name: spec for spec in _SPECS}, ALIASES, {"m": 100.0 if centimetres else 1.0})
+    metre = 100.0 if centimetres else 1.0
+    return ActionSchema({spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, {"m": metre})
+
+
+def _fitted(spec: ActionSpec, metre: float) -> ActionSpec:
+    """The action with what its omitted arguments mean, and the differences that matter to the world."""
+    parameters = {
+        name: replace(
+            parameter,
+            default=DEFAULTS.get((spec.name, name)),
+            resolution=metre if (spec.name, name) in _LENGTHS else 1.0 if parameter.type == "float" else 0.0,
+        )
+        for name, parameter in spec.parameters.items()
+    }
+    return replace(spec, parameters=parameters)
+
+
+SOCIAL = (
+    "SAY",
+    "VIEW_HELP_BOARD",
+    "POST_HELP",
+    "ACCEPT_HELP",
+    "EDIT_HELP",
+    "PLACE_TEMP_BOX",
+    "TAKE_FROM_TEMP_BOX",
+    "REPORT_HELP_FINISHED",
+)
+"""Actions that are addressed to other couriers."""
+
+
+def advertised(schema: ActionSchema) -> ActionSchema:
+    """The schema without the actions that are of no use to the only courier of a city; they still work when called."""
+    specs = {name: spec for name, spec in schema.actions.items() if name not in SOCIAL}
+    return replace(schema, actions=specs)
 
 
 def argument(action: Action, position: int, *names: str) -> Any:

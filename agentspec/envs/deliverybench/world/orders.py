@@ -76,6 +76,10 @@ class OrderBook:
         self._home_of: dict[str, Poi] = {}
         self._offers: dict[int, Offer] = {}
 
+    def __deepcopy__(self, memo: object) -> OrderBook:
+        """Itself: what it draws depends on nothing but the number, and copies of a world share it."""
+        return self
+
     def __getitem__(self, number: int) -> Offer:
         offer = self._offers.get(number)
         if offer is None:

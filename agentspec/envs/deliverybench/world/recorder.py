@@ -76,11 +76,12 @@ class Recorder:
         return recorder
 
 
-def evaluate(state: State, recorder: Recorder, shift_hours: float, initial_balance: float) -> dict[str, float | None]:
+def evaluate(state: State, recorder: Recorder, hours_paid: float, initial_balance: float) -> dict[str, float | None]:
     """The evaluator's figures (None where the denominator is zero).
 
-    Rates are shares in [0, 1], ``*_per_hour`` are per hour of the shift, but ``stamina_per_hour`` and
-    ``interruptions_per_hour`` per active hour. Expenses leave bus fares out, as the benchmark does.
+    Rates are shares in [0, 1], ``hourly_profit`` and ``*_per_hour`` are per hour of ``hours_paid`` (the shift; the time
+    played where an episode was cut), but ``stamina_per_hour`` and ``interruptions_per_hour`` per active hour. Expenses
+    leave bus fares out, as the benchmark does.
     ``time_utilisation`` can exceed 1 because orders overlap.
     """
     done = state.settlements
@@ -95,12 +96,12 @@ def evaluate(state: State, recorder: Recorder, shift_hours: float, initial_balan
     prevented, interrupted = sum(recorder.prevention.values()), sum(recorder.interruptions.values())
     growth = state.balance - initial_balance
     return {
-        "hourly_profit": growth / shift_hours,
+        "hourly_profit": growth / hours_paid,
         "hourly_profit_active": _ratio(growth, hours),
         "net_growth": growth,
-        "base_per_hour": sum(s.base for s in done) / shift_hours,
-        "bonus_per_hour": sum(s.bonus for s in done) / shift_hours,
-        "expense_per_hour": -sum(v for k, v in state.ledger.items() if k not in ("orders", "bus")) / shift_hours,
+        "base_per_hour": sum(s.base for s in done) / hours_paid,
+        "bonus_per_hour": sum(s.bonus for s in done) / hours_paid,
+        "expense_per_hour": -sum(v for k, v in state.ledger.items() if k not in ("orders", "bus")) / hours_paid,
         "pick_quality": _mean(picks),
         "on_time_rate": _ratio(sum(not s.late for s in done), len(done) + overdue),
         "time_utilisation": _ratio(busy, active),
@@ -113,14 +114,22 @@ def evaluate(state: State, recorder: Recorder, shift_hours: float, initial_balan
     }
 
 
-def report(state: State, recorder: Recorder, shift_hours: float, initial_balance: float) -> dict[str, Any]:
-    """The run report: money, energy, orders, activity, interruptions, prevention, actions, calls and evaluation."""
+def report(
+    state: State, recorder: Recorder, shift_hours: float, initial_balance: float, hours_paid: float | None = None
+) -> dict[str, Any]:
+    """The run report: money, energy, orders, activity, interruptions, prevention, actions, calls and evaluation.
+
+    ``hours_paid`` is what the figures per hour divide by, if that is not the shift (see `evaluate`).
+    """
+    per = shift_hours if hours_paid is None else hours_paid
     done, active = state.settlements, state.tick / TICKS
     expenses = {k: -state.ledger[k] for k in ("purchases", "charging", "rental", "hospital", "bus")}
     return {
         "meta": {
             "shift_hours": shift_hours,
             "active_seconds": active,
+            "hours_paid": per,
+            "profit_per": "hour of the shift" if hours_paid is None else "hour played",
             "ended": state.ended,
             "reason": state.reason,
         },
@@ -159,7 +168,7 @@ def report(state: State, recorder: Recorder, shift_hours: float, initial_balance
             name: {"attempts": n, "successes": recorder.successes[name]} for name, n in recorder.attempts.items()
         },
         "calls": {"total": state.calls, "parse_failures": recorder.parse_failures},
-        "evaluation": evaluate(state, recorder, shift_hours, initial_balance),
+        "evaluation": evaluate(state, recorder, per, initial_balance),
     }
 
 

@@ -53,6 +53,7 @@ class Rules:
     bus_tolerance: float = 1000.0
     stop_radius: float = 136.6
     step_length: float = 100.0
+    look_seconds: float = 10.0
 
     # Scooter, charging, rest, hospital
     initial_battery: float = 50.0
@@ -127,6 +128,8 @@ class Rules:
     equal_food_vanishes: bool = quirk("Delivering an order removes equal food of other orders from the bag as well.")
     free_last_metres: bool = quirk("The last 3.6 m of a move and STEP_FORWARD take no time.")
     views_after_parse_errors: bool = quirk("The sixth unreadable answer in a row is taken as VIEW_ORDERS.")
+    free_looks: bool = quirk("Looking again at what is shown already (VIEW_ORDERS, VIEW_BAG, ...) takes no time.")
+    methods_hidden: bool = quirk("The hand-over methods a note allows are not told at the customer's, only the note.")
     last_call_is_cut: bool = quirk("The action of the last allowed call is cut off at its first tick.")
 
     def with_config(self, config: Mapping[str, Any]) -> Rules:

@@ -158,38 +158,3 @@ def _use_pack(world: Shift, action: Action, item: str, name: str) -> str:
     state.bag.advance(state.tick)
     state.bag.insert_pack(label, name)
     return f"put {item} into compartment {label}"
-
-
-def say(world: Shift, action: Action) -> str:
-    """SAY(text=, to=): with one courier in the city nobody but everybody can be addressed."""
-    text = argument(action, 0, "text")
-    if not isinstance(text, str) or not text.strip():
-        raise unread(action, "say something", "SAY_EMPTY")
-    to = action.kwargs.get("to")
-    if to is not None and str(to).strip().lower() not in ("", "all", "*", "everyone", "broadcast"):
-        raise Refused("SAY_UNKNOWN_AGENT", f"there is no courier {short(to)} in this city")
-    world.recorder.social["say"] += 1
-    return "said something to everybody"
-
-
-def view_help_board(world: Shift, action: Action) -> str:
-    """VIEW_HELP_BOARD(): empty, because requests of one's own are not shown."""
-    world.notify("help", "there are no requests for help")
-    return "viewed the help board"
-
-
-def post_help(world: Shift, action: Action) -> str:
-    """POST_HELP(kind=, ...): accepted, but with one courier in the city nobody can answer it."""
-    kind = argument(action, 0, "kind", "help_type")
-    if not isinstance(kind, str) or kind.strip().upper() not in _HELP_KINDS:
-        raise unread(action, f"kind must be one of {', '.join(_HELP_KINDS)}", "HELP_KIND")
-    world.recorder.social["help_posted"] += 1
-    return f"posted a request {kind.strip().upper()}"
-
-
-def no_helper(world: Shift, action: Action) -> str:
-    """The other help actions need a second courier."""
-    raise Refused("HELP_ALONE", f"{action.name} needs another courier; you are the only one in this city")
-
-
-_HELP_KINDS = ("HELP_PICKUP", "HELP_DELIVERY", "HELP_BUY", "HELP_CHARGE")

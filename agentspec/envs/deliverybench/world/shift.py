@@ -8,6 +8,8 @@ Every change of the balance goes through `pay`, which keeps the ledger.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from agentspec.envs.deliverybench.city.citymap import City
 from agentspec.envs.deliverybench.world.bag import MAX_DAMAGE, Bag
@@ -103,11 +105,11 @@ class Shift:
         del recent[:-RECENT]
         self.state.error = ""
 
-    def notify(self, kind: str, text: str) -> None:
-        """Show a notice of this kind, in place of an older one."""
+    def notify(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
+        """Show a notice of this kind, in place of an older one; `data` are the facts behind the text."""
         notices = self.state.notices
         notices[:] = [notice for notice in notices if notice.kind != kind]
-        notices.append(Notice(kind, text))
+        notices.append(Notice(kind, text, data or {}))
 
     def near(self, point: Point | None) -> bool:
         """Whether a point is within reach; None (in use) is."""

@@ -19,9 +19,9 @@ from agentspec.envs.deliverybench.world.orders import OrderBook
 from agentspec.envs.deliverybench.world.recorder import Recorder
 from agentspec.envs.deliverybench.world.rules import Rules
 from agentspec.envs.deliverybench.world.settlement import Settlement
-from agentspec.envs.deliverybench.world.state import Car, Charging, Notice, OrderState, Scooter, State
+from agentspec.envs.deliverybench.world.state import Car, Charging, HelpRequest, Notice, OrderState, Scooter, State
 
-VERSION = 1
+VERSION = 2
 
 _PLAIN = (
     "position",
@@ -78,6 +78,7 @@ def dump(state: State, recorder: Recorder, identity: list[Any]) -> bytes:
         "bag": [state.bag.tick, [[c.air, refs(c.items)] for c in state.bag.compartments.values()]],
         "items": items,
         "settlements": [[getattr(s, name) for name in _SETTLEMENT] for s in state.settlements],
+        "requests": [[r.id, r.kind, r.bounty, r.seconds] for r in state.requests],
         "notices": [[notice.kind, notice.text, dict(notice.data)] for notice in state.notices],
         "recorder": recorder.dump(),
     }
@@ -124,6 +125,7 @@ def _state(data: dict[str, Any], rules: Rules, book: OrderBook) -> State:
     for row in data["settlements"]:
         values: list[Any] = [tuple(value) if isinstance(value, list) else value for value in row]
         state.settlements.append(Settlement(*values))
+    state.requests = [HelpRequest(*row) for row in data["requests"]]
     state.notices = [Notice(kind, text, facts) for kind, text, facts in data["notices"]]
     return state
 

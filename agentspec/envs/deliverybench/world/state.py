@@ -75,6 +75,16 @@ class Notice:
 
 
 @dataclass(slots=True)
+class HelpRequest:
+    """An own request on the board for help: ``kind``, ``bounty`` (dollars), lifetime in seconds (None: no end)."""
+
+    id: int
+    kind: str
+    bounty: float = 0.0
+    seconds: float | None = None
+
+
+@dataclass(slots=True)
 class State:
     """The complete state of one world; see the module docstring for units.
 
@@ -82,8 +92,9 @@ class State:
     the accepted, undelivered orders by id; ``settlements`` the delivered ones in order of delivery. ``pool`` lists the
     ids on offer and ``next_order`` the id that will be drawn next. ``recent`` are the last five successful actions,
     oldest first; ``error`` is the last failure until something succeeds; ``notices`` last until the next action that
-    clears them. ``hospital_until`` is the tick of release; ``interrupt_at`` the tick at which a pending interruption
-    strikes; ``hands_at`` the tick up to which food in the hand has cooled. ``reason`` is "" until the episode ends.
+    clears them; ``requests`` are the own ones on the board for help. ``hospital_until`` is the tick of release;
+    ``interrupt_at`` the tick at which a pending interruption strikes; ``hands_at`` the tick up to which food in hand
+    has cooled. ``reason`` is "" until the episode ends.
     """
 
     position: Point
@@ -105,6 +116,7 @@ class State:
     inventory: dict[str, int] = field(default_factory=dict)
     recent: list[str] = field(default_factory=list)
     error: str = ""
+    requests: list[HelpRequest] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     calls: int = 0
     parse_errors: int = 0

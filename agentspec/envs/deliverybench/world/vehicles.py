@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from agentspec.envs.deliverybench.world.bus import BusTimetable
-from agentspec.envs.deliverybench.world.clock import go_to_hospital, pass_time, stop_charging
+from agentspec.envs.deliverybench.world.clock import go_to_hospital, look, pass_time, stop_charging
 from agentspec.envs.deliverybench.world.grammar import Refused, argument, number, short, unread
 from agentspec.envs.deliverybench.world.moving import charge_way
 from agentspec.envs.deliverybench.world.shift import Shift
-from agentspec.envs.deliverybench.world.state import DEPLETED, PARKED, USABLE, Car, Charging, Notice
+from agentspec.envs.deliverybench.world.state import DEPLETED, PARKED, USABLE, Car, Charging
 from agentspec.envs.deliverybench.world.transport import sent
 from agentspec.types import Action
 
@@ -211,9 +211,9 @@ def _ride(world: Shift, stop: str) -> None:
 def view_bus_schedule(world: Shift, action: Action) -> str:
     """VIEW_BUS_SCHEDULE(): the stops of the line, and what the bus does now."""
     state, rules = world.state, world.rules
+    look(world, "schedule", "this city has no bus")
     phase = world.timetable.phase(state.tick)
     if phase is None:
-        world.notify("schedule", "this city has no bus")
         return "viewed the bus schedule"
     left = max(0.0, phase.until - state.tick / rules.ticks_per_second)
     doing = f"stands at {phase.stop} for {left:.0f}s more"
@@ -222,7 +222,7 @@ def view_bus_schedule(world: Shift, action: Action) -> str:
     line = " - ".join(timetable_line(world))
     text = f"{BusTimetable.bus_id} {doing}. Line: {line}; it waits {rules.bus_dwell:.0f}s at each stop."
     facts = {"stopped": phase.stopped, "stop": phase.stop, "target": phase.target, "seconds": left}
-    state.notices.append(Notice("schedule", text, facts))
+    world.notify("schedule", text, facts)
     return "viewed the bus schedule"
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 from agentspec.envs.deliverybench.world.bag import Item
+from agentspec.envs.deliverybench.world.clock import look
 from agentspec.envs.deliverybench.world.food import toward_ambient
 from agentspec.envs.deliverybench.world.grammar import Refused, argument, ids, short, unread, whole
 from agentspec.envs.deliverybench.world.notes import HAND, METHODS
@@ -19,13 +20,13 @@ from agentspec.types import Action
 
 def view_orders(world: Shift, action: Action) -> str:
     """VIEW_ORDERS(): the orders on offer appear in the next observation."""
-    world.notify("orders", "")
+    look(world, "orders", "")
     return "viewed the orders on offer"
 
 
 def view_bag(world: Shift, action: Action) -> str:
     """VIEW_BAG(): temperatures and contents of the bag appear in the next observation."""
-    world.notify("bag", "")
+    look(world, "bag", "")
     return "viewed the bag"
 
 

@@ -1,29 +1,29 @@
-"""The rows of a running batch: who is in the forward, who waits for a place, which jobs are done."""
+"""Which rows run, which wait, which share the next forward, and which jobs are done."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from agentspec.llm.local_rows import Job, Row, SampleRow, ScoreRow
+from agentspec.llm.local.rows import Job, Row, SampleRow, ScoreRow
 
 
-class Lineup:
+class Scheduler:
     """Rows in order of arrival; those that arrive together are sorted by their tokens, so that neighbours share most.
 
     Args:
-        places: rows that run at once.
+        max_rows: rows that run at once.
         adapter: the adapter of jobs that name none.
         stop_ids: tokens that end a completion.
         decode: token ids to text.
     """
 
     def __init__(
-        self, places: int, adapter: str, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]
+        self, max_rows: int, adapter: str, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]
     ) -> None:
         self.jobs: list[tuple[Job, list[Row]]] = []
         self.running: list[Row] = []
         self._waiting: list[Row] = []
-        self._places = places
+        self._max_rows = max_rows
         self._default = adapter
         self._stop_ids = stop_ids
         self._decode = decode
@@ -38,15 +38,8 @@ class Lineup:
         """The adapter whose turn it is: that of the rows that run, else of the row that has waited longest."""
         return next((r.job.adapter for r in self.rows), self._default)
 
-    @property
-    def rest(self) -> int:
-        """Most tokens that a row still writes. What is only read does not count: reading leaves no room in a forward
-        that another row could use.
-        """
-        return max((r.rest for r in self.rows), default=0)
-
     def add(self, jobs: Sequence[Job]) -> None:
-        """Put the rows of ``jobs`` at the end of the line."""
+        """Put the rows of ``jobs`` at the end of the queue."""
         arrived = []
         for job in jobs:
             job.adapter = job.adapter or self._default
@@ -56,7 +49,7 @@ class Lineup:
         self._waiting += sorted(arrived, key=lambda r: r.tokens)
 
     def admit(self) -> list[Row]:
-        """Give places to waiting rows, as far as there are any; they run from now on.
+        """Let waiting rows run, as far as there is room; returns them.
 
         Rows of one adapter run at a time. While rows of another wait, nobody joins those that run: so every adapter
         has its turn, however many ask for this one.
@@ -64,7 +57,7 @@ class Lineup:
         adapter = self.adapter
         if self.running and any(r.job.adapter != adapter for r in self._waiting):
             return []
-        free = self._places - len(self.running)
+        free = self._max_rows - len(self.running)
         joining = [r for r in self._waiting if r.job.adapter == adapter][:free]
         if joining:
             taken = set(map(id, joining))
@@ -82,3 +75,25 @@ class Lineup:
             job.completions = tuple(r.completion() for r in rows if isinstance(r, SampleRow))
             job.scores = tuple(r.total for r in rows if isinstance(r, ScoreRow))
         return [job for job, _ in done]
+
+
+def schedule(running: Sequence[Row], budget: int) -> list[tuple[Row, int]]:
+    """Which rows read how many tokens in the next forward: short rests first, then long ones in order."""
+    writing: list[tuple[Row, int]] = []
+    reading: list[tuple[Row, int]] = []
+    for row in running:
+        rest = len(row.tokens) - row.computed
+        # A row with a source waits for it in the queue of readers, however little it has to read itself.
+        is_writing = row.source is None and row.computed >= len(row.job.prompt)
+        (writing if is_writing else reading).append((row, rest))
+    step, left = [], budget
+    for row, rest in writing + reading:
+        n = min(rest, left)
+        if n <= 0:
+            break
+        step.append((row, n))
+        left -= n
+        if n < rest:
+            # A later row may copy from this one: the order is kept.
+            break
+    return step

@@ -18,7 +18,7 @@ import torch
 
 from agentspec.llm.base import LLMError
 from agentspec.llm.constrain import ChoiceTrie
-from agentspec.llm.local_cache import Slot
+from agentspec.llm.local.cache import Slot
 from agentspec.types import Completion, Sampling
 
 
@@ -74,11 +74,6 @@ class Row:
         """Positions the row may need in the end."""
         return len(self.tokens) + 1
 
-    @property
-    def rest(self) -> int:
-        """Most tokens that are still to be written."""
-        return 0
-
     def uniform(self) -> float:
         """The row's next number in [0, 1)."""
         return self._random.random()
@@ -104,7 +99,8 @@ class ScoreRow(Row):
         """Logits (n, V) of the next ``n`` wanted positions."""
         n = logits.shape[0]
         targets = torch.tensor(self._targets[:n], device=logits.device)
-        chosen = logits.gather(1, targets[:, None])[:, 0] - logits.logsumexp(-1)
+        # Not `logsumexp`: its exponentials depend, in the last bit, on how many rows there are.
+        chosen = logits.log_softmax(-1).gather(1, targets[:, None])[:, 0]
         self._logprobs += chosen.double().tolist()
         del self._targets[:n]
         self.wanted += n
@@ -150,11 +146,6 @@ class ChoiceRow(SampleRow):
         return len(self.job.prompt) + self._trie.longest
 
     @property
-    def rest(self) -> int:
-        """What the longest choice has left."""
-        return self._trie.longest - len(self.logprobs)
-
-    @property
     def allowed(self) -> tuple[int, ...]:
         """Ids to choose from now."""
         return self._trie.allowed(self._node)
@@ -195,11 +186,6 @@ class FreeRow(SampleRow):
         """The prompt and some of the answer; the slot grows when an answer is long."""
         return len(self.tokens) + min(self.job.sampling.max_tokens, 64)
 
-    @property
-    def rest(self) -> int:
-        """What ``max_tokens`` leaves."""
-        return self.job.sampling.max_tokens - len(self.logprobs)
-
     def take(self, token: int, logprob: float) -> None:
         """Append a sampled token and see whether it ends the completion."""
         self.append(token, logprob)
@@ -221,65 +207,3 @@ class FreeRow(SampleRow):
         text = self._decode(ids[:-1] if ids[-1] in self._stop_ids else ids)
         cuts = [text.index(s) for s in self.job.sampling.stop if s in text]
         return Completion(text[: min(cuts, default=len(text))], tuple(ids), tuple(self.logprobs), (), self._reason)
-
-
-def choose(rows: Sequence[ChoiceRow], logits: torch.Tensor) -> None:
-    """Sample one allowed token per row from ``logits`` (rows, V), renormalised over the allowed ids.
-
-    Temperature applies; top-p and top-k do not. At temperature 0 the best is taken and its log-probability at
-    temperature 1 recorded.
-    """
-    width = max(len(r.allowed) for r in rows)
-    ids = torch.tensor([[*r.allowed, *[r.allowed[0]] * (width - len(r.allowed))] for r in rows], device=logits.device)
-    values = logits.gather(1, ids).cpu()
-    for row, line in zip(rows, values, strict=True):
-        temperature = row.job.sampling.temperature
-        allowed = row.allowed
-        logprobs = torch.log_softmax(line[: len(allowed)] / (temperature or 1.0), -1)
-        if temperature == 0:
-            pick = int(logprobs.argmax())
-        else:
-            cumulative = logprobs.double().exp().cumsum(0)
-            pick = min(int((cumulative <= row.uniform() * cumulative[-1]).sum()), len(allowed) - 1)
-        row.take(allowed[pick], float(logprobs[pick]))
-
-
-def sample(rows: Sequence[FreeRow], logits: torch.Tensor) -> None:
-    """Sample one token per row from ``logits`` (rows, V): temperature, then top-k, then top-p, renormalised.
-
-    At temperature 0 the best token is taken and its log-probability at temperature 1 recorded.
-    """
-    settings = [r.job.sampling for r in rows]
-    temperatures = torch.tensor([s.temperature or 1.0 for s in settings], device=logits.device)
-    logprobs = torch.log_softmax(logits / temperatures[:, None], -1)
-    for i, s in enumerate(settings):
-        if s.temperature > 0 and (s.top_k or s.top_p < 1):
-            logprobs[i] = filter_top(logprobs[i], s.top_k, s.top_p)
-    exact = torch.float32 if logits.device.type == "mps" else torch.float64
-    uniforms = torch.tensor([[r.uniform()] for r in rows], dtype=exact, device=logits.device)
-    cumulative = logprobs.to(exact, copy=True).exp_().cumsum_(-1)
-    picks = torch.searchsorted(cumulative, uniforms * cumulative[:, -1:], right=True).clamp_(max=logits.shape[1] - 1)
-    if any(s.temperature == 0 for s in settings):
-        greedy = torch.tensor([[s.temperature == 0] for s in settings], device=logits.device)
-        picks = torch.where(greedy, logprobs.argmax(-1, keepdim=True), picks)
-    chosen = logprobs.gather(1, picks)
-    for row, token, logprob in zip(rows, picks[:, 0].tolist(), chosen[:, 0].tolist(), strict=True):
-        row.take(token, logprob)
-
-
-def filter_top(logprobs: torch.Tensor, top_k: int, top_p: float) -> torch.Tensor:
-    """Log-probabilities (V,) with all but the ``top_k`` best, then all but the nucleus ``top_p``, set to -inf.
-
-    The nucleus is the smallest set of best tokens whose probabilities reach ``top_p``; what is left is renormalised.
-    """
-    values, order = logprobs.sort(descending=True)
-    if top_k:
-        values, order = values[:top_k], order[:top_k]
-        values = values - values.logsumexp(-1)
-    if top_p < 1:
-        probabilities = values.exp()
-        before = probabilities.cumsum(-1) - probabilities
-        keep = int((before < top_p).sum())
-        values, order = values[:keep], order[:keep]
-        values = values - values.logsumexp(-1)
-    return torch.full_like(logprobs, float("-inf")).scatter_(0, order, values)

@@ -1,15 +1,15 @@
 """The local backend: a live transformers model, possibly the very one under training.
 
-:class:`LocalLLM` turns requests into token rows (:mod:`agentspec.llm.chat`), gathers those of all live episodes into
-one batch (:mod:`agentspec.llm.batching`) and runs it without padding on cached prefixes
-(:mod:`agentspec.llm.local_engine`). The model is never moved, cast or left changed, so a trainer can hand over the
-model it optimises; its weights may change between batches (the caches notice in-place updates; call
-:meth:`LocalLLM.invalidate` after any other change).
+`LocalLLM` turns requests into token rows (`agentspec.llm.chat`), gathers those of all live episodes into one batch
+(`agentspec.llm.batching`) and runs it without padding on cached prefixes (`agentspec.llm.local.engine`). The model is
+never moved, cast or left changed, so a trainer can hand over the model it optimises; its weights may change between
+batches (the caches notice in-place updates; call `LocalLLM.invalidate` after any other change).
 """
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -20,16 +20,16 @@ from agentspec.llm.base import LLMError, Message, Request, require_context
 from agentspec.llm.batching import Batcher, Batching
 from agentspec.llm.chat import ChatFormat
 from agentspec.llm.constrain import ChoiceTrie
-from agentspec.llm.local_adapters import UNTAGGED, adapter_for, check_adapters
-from agentspec.llm.local_engine import Engine
-from agentspec.llm.local_forward import PackedModel
-from agentspec.llm.local_rows import Job
+from agentspec.llm.local.adapters import UNTAGGED, adapter_for, check_adapters
+from agentspec.llm.local.engine import Engine
+from agentspec.llm.local.forward import PackedModel
+from agentspec.llm.local.rows import Job
 from agentspec.llm.models import quiet, resolve
 from agentspec.types import LLMCall, Sampling, Usage
 
 
 class LocalLLM:
-    """An :class:`~agentspec.llm.base.LLM` over a transformers causal language model (or a PEFT model around one).
+    """An `agentspec.llm.base.LLM` over a transformers causal language model (or a PEFT model around one).
 
     Args:
         model: the model; used where it is and as it is.
@@ -40,13 +40,12 @@ class LocalLLM:
             ``2 * layers * key_value_heads * head_size`` numbers.
         max_context: context window; by default the model's.
         template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
-        patience_s: see :class:`~agentspec.llm.batching.Batcher`.
-        batching: see :data:`~agentspec.llm.batching.Batching`. ``"auto"`` is ``"eager"`` where that is repeatable (the
-            model's arithmetic is found to be batch-invariant: float32 on a CPU with MKL), else ``"ordered"``. There,
-            if answers are long and environments take several times as long as a forward of the model, ``"eager"`` is
-            faster, or, if runs must be repeatable, ``"closed"``.
+        patience_s: see `agentspec.llm.batching.Batcher`.
+        batching: `"continuous"` or `"closed"` (see `agentspec.llm.batching`). `"auto"` is `"continuous"` where that is
+            repeatable to the last bit: where the model's arithmetic is found to be batch-invariant (float32 on a CPU).
+            Elsewhere (accelerators, 16-bit floats, mixtures of experts) it is `"closed"`, and a warning says so.
         adapters: which adapter of a PEFT model answers which calls: shell pattern over the call's tag path -> name,
-            first match wins (see :mod:`~agentspec.llm.local_adapters`), e.g.
+            first match wins (see `agentspec.llm.local.adapters`), e.g.
             ``{"reflection.retroformer/*": "reflector", "*": "actor"}``. What matches nothing is answered by the
             adapter that is active.
 
@@ -89,9 +88,10 @@ class LocalLLM:
             max_cache_tokens=max_cache_tokens,
         )
         self._choose_batching = batching == "auto"
-        first: Batching = "ordered" if batching == "auto" else batching
+        first: Batching = "closed" if batching == "auto" else batching
         self._batcher: Batcher[Job] = Batcher(self._run, patience_s=patience_s, batching=first)
         self._left: deque[str] = deque()
+        self._warned = False
         self._trie = lru_cache(maxsize=512)(self._make_trie)
 
     @classmethod
@@ -105,7 +105,7 @@ class LocalLLM:
         name: str | None = None,
         **kwargs: Any,
     ) -> LocalLLM:
-        """Load a model by folder, bundled name or hub id (see :func:`~agentspec.llm.models.resolve`).
+        """Load a model by folder, bundled name or hub id (see `agentspec.llm.models.resolve`).
 
         Args:
             name_or_path: which model.
@@ -113,7 +113,7 @@ class LocalLLM:
             dtype: ``"auto"`` (as stored), ``"float32"``, ``"bfloat16"`` or ``"float16"``.
             device: ``"auto"`` (the first accelerator, else the CPU) or a torch device.
             name: model name in the records; by default the one it was found by.
-            kwargs: as of :class:`LocalLLM`.
+            kwargs: as of `LocalLLM`.
 
         Raises:
             ModelNotFoundError: no such model or adapter.
@@ -142,7 +142,7 @@ class LocalLLM:
         return cls(model, tokenizer, name=name or source.name, **kwargs)
 
     async def generate(self, request: Request) -> LLMCall:
-        """Sample ``request.sampling.n`` completions (see :class:`~agentspec.llm.base.LLM`)."""
+        """Sample ``request.sampling.n`` completions (see `agentspec.llm.base.LLM`)."""
         began = time.perf_counter()
         sampling = request.sampling
         prompt = self.chat.render(request.messages)
@@ -185,8 +185,11 @@ class LocalLLM:
         self._batcher.leave(episode)
 
     def invalidate(self) -> None:
-        """Drop all cached keys and values: the weights, or the adapter in use, changed."""
-        self._engine.cache.clear()
+        """Drop all cached keys and values, and packed weights: the weights changed in a way torch does not count.
+
+        Writes in place, as optimisers make them, and another active adapter are noticed without it.
+        """
+        self._engine.invalidate()
 
     async def _submit(self, number: int, job: Job) -> None:
         await self._batcher.submit(job.episode, number, job)
@@ -198,10 +201,10 @@ class LocalLLM:
         self._release()
         left = {id(job): job for job in jobs}
 
-        def exchange(done: Sequence[Job], rest: int) -> Sequence[Job]:
+        def exchange(done: Sequence[Job]) -> Sequence[Job]:
             for job in done:
                 del left[id(job)]
-            joining = self._batcher.exchange(done, rest)
+            joining = self._batcher.exchange(done)
             if joining:
                 self._release()
             left.update((id(job), job) for job in joining)
@@ -209,7 +212,7 @@ class LocalLLM:
 
         try:
             if self._choose_batching:
-                self._batcher.batching = "eager" if self._engine.model.invariant() else "ordered"
+                self._batcher.batching = self._repeatable()
             self._engine.run(jobs, exchange)
         except LLMError:
             raise
@@ -221,6 +224,29 @@ class LocalLLM:
                 return
             for job in left.values():
                 self._run_alone(job)
+
+    @property
+    def batching(self) -> Batching:
+        """How requests are batched; with `"auto"`, decided before the first batch."""
+        return self._batcher.batching
+
+    def _repeatable(self) -> Batching:
+        """The fastest way of batching that repeats to the last bit; says so when it is not the fastest of all."""
+        if self._engine.model.invariant():
+            return "continuous"
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the logits of {self.name} depend, in the last bits, on what shares a forward ({self._arithmetic()}): "
+                "batches are closed, so that the run repeats; `batching: continuous` is faster and does not repeat, "
+                "and float32 on a CPU does both",
+                stacklevel=2,
+            )
+        return "closed"
+
+    def _arithmetic(self) -> str:
+        weight = next(self.model.parameters())
+        return f"{type(self.model).__name__}, {str(weight.dtype).removeprefix('torch.')} on {weight.device.type}"
 
     def _release(self) -> None:
         """Free what ended episodes have cached when others join, not when they happen to end: that hangs on timing."""

@@ -1,15 +1,17 @@
 """Attention of many sequences in one row of tokens: each segment of new tokens sees its own sequence only.
 
-This is what the packed forward (:mod:`agentspec.llm.local_forward`) puts in the place of a model's attention. A
+This is what the packed forward (`agentspec.llm.local.forward`) puts in the place of a model's attention. A
 segment's new keys and values are stored in its slot, and its queries attend to the slot. The query heads that share a
 key-value head are laid side by side as more queries of that head, so that keys and values are read once and never
 repeated.
 
 On a CPU segments go one by one, each against whole blocks of keys of which those to come are hidden: then the order in
-which a token's keys are summed up depends on its position alone, not on how many tokens are read at once, and the same
-token in the same context has the same keys, values and logits, bit for bit, whoever else is in the batch. On an
-accelerator, where a launch costs more than the work, the segments of one token (sequences that are writing) are
-gathered into one padded batch.
+which a token's keys are summed up depends on its position alone, not on how many tokens are read at once. torch's
+kernel takes queries in blocks of 32 (64, 256 for more), and MKL multiplies the rows of a last block of fewer than 4 by
+other kernels: such a block is filled up to 4. And a single head would be multiplied by all threads together, in pieces
+that depend on the number of queries: it is given to the kernel as several. So the same token in the same context is the
+same, bit for bit, whoever else is in the batch (`agentspec.llm.local.invariance`). On an accelerator, where a launch
+costs more than the work, the segments of one token (sequences that are writing) are gathered into one padded batch.
 """
 
 from __future__ import annotations
@@ -24,13 +26,16 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 
 from agentspec.llm.base import LLMError
-from agentspec.llm.local_cache import Slot
+from agentspec.llm.local.cache import Slot
+from agentspec.llm.local.invariance import MIN_ROWS, elementwise
 
 _ACTIVE = threading.local()
 _BATCHED_FROM = {"cpu": 1 << 30}
 _BATCHED_FROM_DEFAULT = 4
 _KEYS = {"cpu": 512}
 """Keys that torch's attention kernel takes at a time."""
+_QUERIES = {"cpu": 32}
+"""Queries that it takes at a time, or a divisor of them."""
 
 
 def slot_block(device: torch.device) -> int:
@@ -90,7 +95,7 @@ class _Scores:
 
 @contextmanager
 def active(pack: Pack) -> Iterator[None]:
-    """The pack that :func:`packed_attention` works on, in this thread."""
+    """The pack that `packed_attention` works on, in this thread."""
     _ACTIVE.pack = pack
     try:
         yield
@@ -126,6 +131,7 @@ def packed_attention(
     layer = int(module.layer_idx)  # type: ignore[arg-type]
     scores = _Scores(scaling, sliding_window or 0, softcap, s_aux)
     out = query.new_empty(1, query.shape[2], query.shape[1], value.shape[-1])
+    out[:, pack.bounds[-1][1] :] = 0.0  # padding tokens attend to nothing
     alone, together = pack.split(query.device)
     for i in alone:
         begin, end = pack.bounds[i]
@@ -150,11 +156,26 @@ def _one(pack: Pack, segment: Segment, layer: int, query: torch.Tensor, scores: 
     keys, values = segment.slot.layer(layer)
     block = _KEYS.get(query.device.type, 1)
     padded = min(-(-total // block) * block, segment.slot.capacity)
-    groups = heads // keys.shape[0]
-    q = query.reshape(1, keys.shape[0], groups * n, -1)
-    mask = _causal_mask(pack, n, total, padded, groups, scores.window, q)
-    o = _attend(q, keys[None, :, :padded], values[None, :, :padded], mask, groups, scores)
-    return o.reshape(heads, n, -1).transpose(0, 1)
+    keys, values = keys[None, :, :padded], values[None, :, :padded]
+    kv_heads = keys.shape[1]
+    if kv_heads == 1 and query.device.type == "cpu":
+        kv_heads = max(2, heads)
+        query, keys, values = (x.expand(1, kv_heads, -1, -1) for x in (query, keys, values))
+    groups = max(1, heads // kv_heads)
+    rows = _query_rows(groups * n, query.device)
+    q = query.reshape(1, kv_heads, groups * n, -1)
+    if rows > groups * n:
+        q = torch.nn.functional.pad(q, (0, 0, 0, rows - groups * n))
+    mask = _causal_mask(pack, n, total, padded, groups, rows, scores.window, q)
+    o = _attend(q, keys, values, mask, groups, n, scores)[:, :, : groups * n]
+    return o.reshape(-1, n, o.shape[-1])[:heads].transpose(0, 1)
+
+
+def _query_rows(rows: int, device: torch.device) -> int:
+    """Rows of queries with the last block of the kernel filled up to `MIN_ROWS`."""
+    block = _QUERIES.get(device.type, 1)
+    last = rows % block
+    return rows if last == 0 else rows + max(0, MIN_ROWS - last)
 
 
 def _batch(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
@@ -171,13 +192,15 @@ def _batch(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Ten
     groups = query.shape[0] // keys.shape[0]
     q = query.transpose(0, 1).reshape(len(segments), keys.shape[0], groups, -1)
     mask = _padding_mask(pack, totals, scores.window, q)
-    return _attend(q, k, v, mask, groups, scores).reshape(len(segments), query.shape[0], -1)
+    return _attend(q, k, v, mask, groups, 1, scores).reshape(len(segments), query.shape[0], -1)
 
 
 def _causal_mask(
-    pack: Pack, n: int, total: int, padded: int, groups: int, window: int, like: torch.Tensor
+    pack: Pack, n: int, total: int, padded: int, groups: int, rows: int, window: int, like: torch.Tensor
 ) -> torch.Tensor | None:
-    """Additive mask (groups * n, padded) of the last ``n`` of ``total`` positions; ``None`` if nothing is hidden."""
+    """Additive mask (rows, padded) of the last ``n`` of ``total`` positions, for ``groups`` times ``n`` queries and
+    padding that sees everything; ``None`` if nothing is hidden.
+    """
     if n == 1 and padded == total and not 0 < window < total:
         return None
     cached = pack.masks.get((n, total, groups, window))
@@ -187,8 +210,9 @@ def _causal_mask(
         hidden = there > here
         if window:
             hidden |= there <= here - window
-        mask = torch.zeros(n, padded, dtype=like.dtype, device=like.device).masked_fill_(hidden, float("-inf"))
-        cached = pack.masks[n, total, groups, window] = mask.repeat(groups, 1)
+        mask = torch.zeros(rows, padded, dtype=like.dtype, device=like.device)
+        mask[: groups * n].masked_fill_(hidden.repeat(groups, 1), float("-inf"))
+        cached = pack.masks[n, total, groups, window] = mask
     return cached
 
 
@@ -207,19 +231,28 @@ def _padding_mask(pack: Pack, totals: Sequence[int], window: int, like: torch.Te
 
 
 def _attend(
-    q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, mask: torch.Tensor | None, groups: int, scores: _Scores
+    q: torch.Tensor,
+    k: torch.Tensor,
+    v: torch.Tensor,
+    mask: torch.Tensor | None,
+    groups: int,
+    n: int,
+    scores: _Scores,
 ) -> torch.Tensor:
-    """Attention of (B, key-value heads, groups * n, size) queries, written out where the fused kernel lacks
-    something."""
+    """Attention of (B, key-value heads, groups * n and padding, size) queries, written out where the fused kernel
+    lacks something.
+    """
     if scores.softcap is None and scores.sinks is None:
         return scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=scores.scaling)
     weights = torch.matmul(q, k.transpose(-1, -2)).float()
     weights = weights * (q.shape[-1] ** -0.5 if scores.scaling is None else scores.scaling)
     if scores.softcap is not None:
-        weights = torch.tanh(weights / scores.softcap) * scores.softcap
+        weights = elementwise(torch.tanh, weights / scores.softcap) * scores.softcap
     if mask is not None:
         weights = weights + mask.float()
     if scores.sinks is not None:
-        sinks = scores.sinks.float().reshape(1, -1, groups, 1).repeat_interleave(q.shape[2] // groups, dim=2)
-        weights = torch.cat([weights, sinks.expand(q.shape[0], -1, -1, -1)], dim=-1)
+        sinks = scores.sinks.float().reshape(1, -1, groups, 1).repeat_interleave(n, dim=2)
+        padding = sinks.new_zeros(1, sinks.shape[1], q.shape[2] - sinks.shape[2], 1)
+        sinks = torch.cat([sinks, padding], 2).expand(q.shape[0], q.shape[1], -1, -1)
+        weights = torch.cat([weights, sinks], dim=-1)
     return torch.matmul(weights.softmax(-1)[..., : k.shape[2]].to(v.dtype), v)

@@ -7,7 +7,7 @@ takes the rows that are writing first and fills up with tokens still to be read:
 tokens costs nearly as much as one of 64, so writing beside another row's reading is almost free.
 
 Between two forwards the jobs that are done can be exchanged for others, whose rows then join those that run
-(continuous batching): :meth:`Engine.run` does not know when that is wise (:mod:`agentspec.llm.batching` does).
+(continuous batching); who joins when is decided in `agentspec.llm.batching`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ from itertools import pairwise
 
 import torch
 
-from agentspec.llm.local_adapters import active_adapter, using
-from agentspec.llm.local_attention import slot_block
-from agentspec.llm.local_cache import PrefixCache
-from agentspec.llm.local_forward import PackedModel, Segment
-from agentspec.llm.local_lineup import Lineup
-from agentspec.llm.local_rows import ChoiceRow, FreeRow, Job, Row, ScoreRow, choose, sample
+from agentspec.llm.local.adapters import active_adapter
+from agentspec.llm.local.attention import slot_block
+from agentspec.llm.local.cache import PrefixCache
+from agentspec.llm.local.forward import PackedModel, Segment
+from agentspec.llm.local.invariance import version
+from agentspec.llm.local.rows import ChoiceRow, FreeRow, Job, Row, ScoreRow
+from agentspec.llm.local.sampling import choose, sample
+from agentspec.llm.local.scheduler import Scheduler, schedule
 from agentspec.tokens import shared_prefix
 
-Exchange = Callable[[Sequence[Job], int], Sequence[Job]]
-"""Jobs that are done, and how many tokens the others still write at most -> jobs that join."""
+Exchange = Callable[[Sequence[Job]], Sequence[Job]]
+"""Jobs that are done -> jobs that join."""
 
 _TOKENS_PER_FORWARD = {"cpu": 512}
 _DEFAULT_TOKENS = 8192
@@ -59,37 +61,38 @@ class Engine:
         self._max_batch = max_batch
         self._weights: tuple[int, int] | None = None
 
-    def run(self, jobs: Sequence[Job], exchange: Exchange = lambda done, rest: ()) -> None:
+    def run(self, jobs: Sequence[Job], exchange: Exchange = lambda done: ()) -> None:
         """Fill in ``completions`` or ``scores``, and ``cached``, of every job.
 
         Args:
             jobs: what to begin with.
-            exchange: called between two forwards with the jobs that are done (often none) and the most tokens that a
-                row still writes; returns the jobs that join.
+            exchange: called between two forwards with the jobs that are done (often none); returns those that join.
         """
         self.model.check()
         self._forget_old_weights()
-        lineup = Lineup(self._max_batch, active_adapter(self.model.model), self._stop_ids, self._decode)
-        lineup.add(jobs)
+        scheduler = Scheduler(self._max_batch, active_adapter(self.model.model), self._stop_ids, self._decode)
+        scheduler.add(jobs)
         with self.model.session():
-            while lineup.jobs:
-                self._run_group(lineup, exchange)
+            while scheduler.jobs:
+                self._run_adapter(scheduler, exchange)
                 # Some needed no forward.
-                lineup.add(exchange(lineup.collect(), lineup.rest))
+                scheduler.add(exchange(scheduler.collect()))
 
-    def _run_group(self, lineup: Lineup, exchange: Exchange) -> None:
+    def _run_adapter(self, scheduler: Scheduler, exchange: Exchange) -> None:
         """Forwards with one adapter, as long as it has its turn."""
-        adapter = lineup.adapter
+        adapter = scheduler.adapter
         budget = _TOKENS_PER_FORWARD.get(self.model.device.type, _DEFAULT_TOKENS)
-        with using(self.model.model, adapter):
-            while lineup.rows and lineup.adapter == adapter:
-                running = list(lineup.running)
-                self._place(lineup.admit(), running)
-                self._advance(_schedule(lineup.running, budget))
-                for row in lineup.running:
+        if not scheduler.rows:
+            return
+        with self.model.adapter(adapter):
+            while scheduler.rows and scheduler.adapter == adapter:
+                running = list(scheduler.running)
+                self._place(scheduler.admit(), running)
+                self._advance(schedule(scheduler.running, budget))
+                for row in scheduler.running:
                     if row.done:
-                        self._finish(row, lineup.running)
-                lineup.add(exchange(lineup.collect(), lineup.rest))
+                        self._finish(row, scheduler.running)
+                scheduler.add(exchange(scheduler.collect()))
 
     def _place(self, rows: Sequence[Row], running: Sequence[Row]) -> None:
         """Give each row a slot with what is known of it, and the row before it as the source of what they share."""
@@ -149,10 +152,15 @@ class Engine:
         length = len(row.job.prompt) if isinstance(row, ScoreRow) else row.slot.length
         self.cache.put(row.slot, row.tokens[: min(length, row.slot.length)])
 
+    def invalidate(self) -> None:
+        """Forget keys, values and packed weights: the weights changed."""
+        self.cache.clear()
+        self.model.invalidate()
+
     def _forget_old_weights(self) -> None:
         """Drop the cache when the weights of the model or of any adapter were written to since the last call."""
-        parameters = [p for p in self.model.model.parameters() if not p.is_inference()]
-        weights = (sum(p._version for p in parameters), sum(p.data_ptr() for p in parameters))
+        parameters = list(self.model.model.parameters())
+        weights = (sum(map(version, parameters)), sum(p.data_ptr() for p in parameters))
         if self._weights not in (None, weights):
             self.cache.clear()
         self._weights = weights
@@ -170,25 +178,3 @@ def _copy_longest(row: Row, running: Sequence[Row]) -> None:
                 best, length = other, shared
     if best is not None:
         row.slot.copy_prefix(best.slot, length)
-
-
-def _schedule(active: Sequence[Row], budget: int) -> list[tuple[Row, int]]:
-    """Which rows read how many tokens in the next forward: short rests first, then long ones in order."""
-    writing: list[tuple[Row, int]] = []
-    reading: list[tuple[Row, int]] = []
-    for row in active:
-        rest = len(row.tokens) - row.computed
-        # A row with a source waits for it in the queue of readers, however little it has to read itself.
-        is_writing = row.source is None and row.computed >= len(row.job.prompt)
-        (writing if is_writing else reading).append((row, rest))
-    step, left = [], budget
-    for row, rest in writing + reading:
-        n = min(rest, left)
-        if n <= 0:
-            break
-        step.append((row, n))
-        left -= n
-        if n < rest:
-            # A later row may copy from this one: the order is kept.
-            break
-    return step

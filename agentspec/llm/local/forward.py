@@ -7,12 +7,11 @@ segment look at its own slot only. So a batch of unequal prompts costs exactly i
 of one batch share is computed once and copied, and reading a prompt, decoding and forced runs of tokens are the same
 operation.
 
-What a segment's logits are does not depend on what else is in the row, but for rounding. On CPUs it does not even by
-that, where matrix products treat rows alike (MKL does when asked to, see :mod:`agentspec`):
-:meth:`PackedModel.invariant` tries it out.
+What a segment's logits are does not depend on what else is in the row, but for rounding; on CPUs not even by that
+(`agentspec.llm.local.invariance`; `PackedModel.invariant` tries it out).
 
 It works with every decoder that uses the attention interface of transformers, whatever its weights (float types, LoRA
-adapters); :meth:`PackedModel.check` compares it with the model's ordinary forward before its first use.
+adapters); `PackedModel.check` compares it with the model's ordinary forward before its first use.
 """
 
 from __future__ import annotations
@@ -25,16 +24,19 @@ from typing import Any
 import torch
 
 from agentspec.llm.base import LLMError
-from agentspec.llm.local_attention import Pack, Segment, active, packed_attention, slot_block
-from agentspec.llm.local_cache import Slot
+from agentspec.llm.local.adapters import active_adapter, using
+from agentspec.llm.local.attention import Pack, Segment, active, packed_attention, slot_block
+from agentspec.llm.local.cache import Slot
+from agentspec.llm.local.invariance import MIN_ROWS, InvariantModules
+from agentspec.llm.local.probe import is_batch_invariant
 
 _ATTENTION = "agentspec_packed"
 _LAYER_TYPES = frozenset({"full_attention", "sliding_attention", "attention"})
-_CHUNKS = (1, 2, 5, 17, 30, 1, 41)
+_MIN_ROWS = {"cpu": MIN_ROWS}
 
 
 class PackedModel:
-    """A live transformers model behind :meth:`forward`; it is never moved, cast or left changed.
+    """A live transformers model behind `forward`; it is never moved, cast or left changed.
 
     Raises:
         LLMError: the architecture cannot be driven by position ids, or keeps a state other than keys and values.
@@ -53,11 +55,13 @@ class PackedModel:
                 f"state, or has layers other than full and sliding attention ({sorted(other) or 'none named'}); serve "
                 "it (vLLM) and use the `openai` backend"
             )
+        self.text_config = text
         self.layers = int(text.num_hidden_layers)
         self.max_context = int(getattr(text, "max_position_embeddings", None) or 1 << 30)
         self._keeps = "logits_to_keep" in parameters
+        self._modules = InvariantModules(model)
         self._checked = False
-        self._invariant: bool | None = None
+        self._invariant: tuple[int, bool] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -67,9 +71,10 @@ class PackedModel:
     def forward(self, segments: Sequence[Segment]) -> list[torch.Tensor]:
         """Run all segments, in order; per segment the float32 logits of its last ``logits`` positions, (logits, V).
 
-        Slots are extended (``length``) by what was computed. Call inside :meth:`session`.
+        Slots are extended (``length``) by what was computed. Call inside `session` and `adapter`.
         """
         device = self.device
+        least = _MIN_ROWS.get(device.type, 1)
         bounds: list[tuple[int, int]] = []
         tokens: list[int] = []
         positions: list[int] = []
@@ -81,14 +86,15 @@ class PackedModel:
             positions.extend(range(s.start, s.start + len(s.tokens)))
             bounds.append((begin, len(tokens)))
             wanted.extend(range(len(tokens) - s.logits, len(tokens)))
-        ids = torch.tensor([tokens], device=device)
+        padding = [0] * (least - len(tokens))
+        ids = torch.tensor([tokens + padding], device=device)
         # The head must compute something, even if nothing is wanted.
-        keep = torch.tensor(wanted or [len(tokens) - 1], device=device)
+        keep = torch.tensor(wanted + [0] * (max(least, 1) - len(wanted)), device=device)
         arguments = {"logits_to_keep": keep} if self._keeps else {}
         with active(Pack(segments, bounds)):
             out = self.model(
                 input_ids=ids,
-                position_ids=torch.tensor([positions], device=device),
+                position_ids=torch.tensor([positions + padding], device=device),
                 use_cache=False,
                 return_dict=True,
                 **arguments,
@@ -116,6 +122,16 @@ class PackedModel:
                 for config, implementation in configs.values():
                     config._attn_implementation_internal = implementation
 
+    @contextmanager
+    def adapter(self, name: str) -> Iterator[None]:
+        """Adapter `name` (`""`: the active one) answers inside, by products that do not depend on the batch."""
+        with using(self.model, name or active_adapter(self.model)), self._modules.in_use():
+            yield
+
+    def invalidate(self) -> None:
+        """Forget packed weights: they changed in a way that their versions do not tell."""
+        self._modules.clear()
+
     def check(self) -> None:
         """Compare the packed forward with the model's own on a few tokens, once.
 
@@ -126,7 +142,7 @@ class PackedModel:
             return
         vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
         tokens = [(7 * i * i + 3 * i + 1) % vocabulary for i in range(12)]
-        with self.session():
+        with self.session(), self.adapter(""):
             slots = [Slot(self.layers, 16, slot_block(self.device)) for _ in range(2)]
             packed = [
                 self.forward([Segment(slots[0], tokens[:5], 0)]),
@@ -153,24 +169,13 @@ class PackedModel:
     def invariant(self) -> bool:
         """Whether a token's logits are the same, to the last bit, however many others are computed with it.
 
-        Found out once, by reading a text whole and in pieces beside another.
+        Tried out (`agentspec.llm.local.probe`) once for each architecture and number of threads in a process.
         """
-        if self._invariant is None:
+        threads = torch.get_num_threads()
+        if self._invariant is None or self._invariant[0] != threads:
             self.check()
-            vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
-            text, other = ([(7 * i * i + a * i + 1) % vocabulary for i in range(sum(_CHUNKS))] for a in (3, 5))
-            whole, pieces, beside = (Slot(self.layers, len(text), slot_block(self.device)) for _ in range(3))
-            start, equal = 0, True
-            with self.session():
-                (expected,) = self.forward([Segment(whole, text, 0, len(text))])
-                for n in _CHUNKS:
-                    stop = start + n
-                    segments = [Segment(pieces, text[start:stop], start, n), Segment(beside, other[start:stop], start)]
-                    # The first is read alone.
-                    equal &= torch.equal(self.forward(segments[: 1 + bool(start)])[0], expected[start:stop])
-                    start = stop
-            self._invariant = equal
-        return self._invariant
+            self._invariant = threads, is_batch_invariant(self)
+        return self._invariant[1]
 
 
 @contextmanager

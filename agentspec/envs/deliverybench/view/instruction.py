@@ -1,0 +1,131 @@
+"""The static instruction of a task: role, goal, rules, and for native play also prices and places.
+
+It holds everything that never changes within a task, so that the prompts of all steps share it as a prefix. How to
+answer is not in it: that is the business of whoever asks.
+"""
+
+from __future__ import annotations
+
+from agentspec.envs.deliverybench.city.citymap import City
+from agentspec.envs.deliverybench.view.cards import SERVICES
+from agentspec.envs.deliverybench.view.wording import HERE, at, duration
+from agentspec.envs.deliverybench.world.rules import Rules
+
+
+def instruction(city: City, rules: Rules, shift_hours: float, compact: bool, menu: bool) -> str:
+    """The instruction: for the menu and compact texts a short one, in full texts with prices and all places."""
+    goal = (
+        f"You are a delivery courier. Earn as much money as you can before the shift of "
+        f"{duration(shift_hours * 3600.0)} ends: accept orders, pick the food up when it is ready, put it into your "
+        "bag, and hand it over in time and the way the customer's note asks for."
+    )
+    if menu and compact:
+        return f"{goal}\n\n{_listed(_brief(rules))}"
+    if menu:
+        lines = [*_reach(rules, compact), *_trade(rules, menu), *_numbers(rules), *_menu(rules)]
+        return f"{goal}\n\n{_listed(lines)}"
+    lines = ["Coordinates are metres, x east, y north; write them with the unit m.", *_reach(rules, compact)]
+    lines += [*_trade(rules, menu), *_numbers(rules), *_habits(rules, compact)]
+    parts = [goal, _listed(lines), _prices(rules)]
+    if not compact:
+        parts.append(_places(city))
+    return "\n\n".join(parts)
+
+
+def _listed(lines: list[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _reach(rules: Rules, compact: bool) -> list[str]:
+    reach = f"{rules.nearby / 100:.0f}m"
+    return [
+        f'You act on what is within {reach} of you; it is marked "{HERE}". Distances are ways along the streets.',
+        "A dish stands with the temperature to serve it at; "
+        + ("once fetched as now/serve: Burger 58/60C." if compact else "in hands and bag with the one it has now."),
+    ]
+
+
+def _trade(rules: Rules, menu: bool) -> list[str]:
+    """How money is made."""
+    lines = [
+        f"A restaurant starts cooking when you accept; an order pays about ${rules.pay_per_km:.0f} per km, plus up to "
+        f"${rules.bonus[5]:.0f} for five stars. From {rules.grace:.0f}s after the deadline on the pay shrinks; what is "
+        "not delivered when the shift ends pays nothing.",
+        "Stars: time first, then food (temperature, smell, damage), then the hand-over the note asks for.",
+        "Carry several orders at once when their restaurants and customers lie on one way; finish what you accepted.",
+    ]
+    if not menu:
+        lines.append(
+            "Bag hot and cold food into different compartments, smelly food apart. The pace accel is a quarter faster, "
+            "uses a quarter more energy and battery per metre, and shakes fragile food in the bag."
+        )
+        if not rules.ride_with_food_in_hand:
+            lines.append("No vehicle moves while you hold food in your hands: put it into the bag first.")
+    return lines
+
+
+def _numbers(rules: Rules) -> list[str]:
+    speed, energy = rules.speed, rules.energy_per_m
+    return [
+        f"Speed m/s: walk {speed['walk'] / 100:g}, e-scooter {speed['e-scooter'] / 100:g}, dragging it "
+        f"{speed['drag_scooter'] / 100:g}, car {speed['car'] / 100:g}.",
+        f"Energy %/km: walk {energy['walk'] * 1000:g}, e-scooter {energy['e-scooter'] * 1000:g}, car "
+        f"{energy['car'] * 1000:g}; at 0 you wake up in hospital {rules.hospital_seconds / 60:.0f} min later, "
+        f"${rules.hospital_fee:.0f} poorer. The scooter's battery loses {rules.battery_per_m * 1000:g} %/km.",
+        f"Charging adds {rules.charge_per_min:g} %/min (${rules.charge_price:.2f} per %), also while you walk away; "
+        f"resting adds {rules.rest_per_min:g} %/min.",
+    ]
+
+
+def _habits(rules: Rules, compact: bool) -> list[str]:
+    """What a courier should and should not do over and over."""
+    cost = "" if rules.free_looks else f" (that costs {rules.look_seconds:.0f}s)"
+    board = "The best offers are shown all the time, all of them after VIEW_ORDERS()"
+    if not compact:
+        board = "VIEW_ORDERS() shows the offers"
+    board += f" until you accept, move or work; do not look again while they are shown{cost}. Accept all you want of "
+    board += "them in one action."
+    return [
+        board,
+        "Do not repeat an action that has just failed: read why, and do something else.",
+        "Have a plan for the next stops and keep to it until something changes.",
+    ]
+
+
+def _menu(rules: Rules) -> list[str]:
+    """How to read the menu."""
+    return [
+        '"hurry" is a quarter faster than "go", but shakes fragile food and drains more per metre. A rented car costs '
+        f"${rules.rental_per_min:.0f} a minute until it is returned; a drink gives energy, a pack fills the battery.",
+        '"more choices" turns the page and takes no time.',
+    ]
+
+
+def _brief(rules: Rules) -> list[str]:
+    """All a small model needs for the menu."""
+    return [
+        f"An order pays about ${rules.pay_per_km:.0f} per km and up to ${rules.bonus[5]:.0f} for good service; late, "
+        "cold or shaken food pays less, and food not delivered when the shift ends nothing.",
+        "Carry several orders at once when they lie on one way; finish what you accepted.",
+        f"Charge before the battery is empty, or rent a car: twice as fast, ${rules.rental_per_min:.0f} a minute.",
+        '"hurry" is faster than "go", but shakes fragile food. "more choices" shows the others, without loss of time.',
+        "Beside an offer: pay, way to the restaurant + on to the customer, time allowed.",
+    ]
+
+
+def _prices(rules: Rules) -> str:
+    goods = ", ".join(f"{item} ${price:.0f}" for item, price in sorted(rules.prices.items()))
+    return (
+        f"Stores sell: {goods}. A drink gives {rules.drink_gain:.0f} % energy, a battery pack fills the scooter's "
+        f"battery, an ice or heat pack keeps a compartment cold or hot. A car costs ${rules.rental_per_min:.2f} per "
+        f"minute from renting to returning, the bus ${rules.bus_fare:.2f}."
+    )
+
+
+def _places(city: City) -> str:
+    lines = ["Places:"]
+    for kind in ("restaurant", *SERVICES):
+        names = [f"{poi.name} {at((poi.anchor[0] / 100.0, poi.anchor[1] / 100.0))}" for poi in city.pois_of(kind)]
+        if names:
+            lines.append("; ".join(names))
+    return "\n".join(lines)
