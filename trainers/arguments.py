@@ -104,8 +104,9 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         if value is None:
             result.pop(key, None)
         elif isinstance(value, Mapping):
-            same = isinstance(under, Mapping) and value.get("name", under.get("name")) == under.get("name")
-            result[key] = merged(under if same else {}, value)
+            below: Mapping[str, Any] = under if isinstance(under, Mapping) else {}
+            another = value.get("name", below.get("name")) != below.get("name")
+            result[key] = merged({} if another else below, value)
         else:
             result[key] = value
     return result
@@ -116,7 +117,7 @@ class _Parser(argparse.ArgumentParser):
         raise SpecError(f"{message}; a configuration is given as `--config FILE`")
 
 
-class _ConfigParser(TrlParser):  # type: ignore[misc]  # TRL's parser has no types
+class _ConfigParser(TrlParser):
     """TRL's parser; wrong input is one line, no option may be abbreviated, and help begins with what is ours."""
 
     def __init__(self, config: type, *, source: str, description: str) -> None:
