@@ -2,7 +2,7 @@
 
     python recipes/retroformer_delivery.py --config recipes/configs/retroformer_cpu.yaml
 
-The trained reflector lies in ``output_dir``, the frozen actor in its folder ``actor``. The table at the end says what
+The trained reflector lies in `output_dir`, the frozen actor in its folder `actor`. The table at the end says what
 lessons bring on held-out shifts: each is played, reflected on if it was not good enough, and played again, with the
 reflector as it was before training and as it is after.
 """
@@ -19,7 +19,7 @@ from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
-    """Train the reflector, draw the curve of gains, evaluate: ``evaluation.md`` and ``evaluation.jsonl``."""
+    """Train the reflector, draw the curve of gains, evaluate: `evaluation.md` and `evaluation.jsonl`."""
     from trainers.arguments import parse_config
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import RetroformerTrainer, as_retroformer
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
-    """Two trials of every held-out task with either reflector: rows, also in ``folder`` with their table."""
+    """Two trials of every held-out task with either reflector: rows, also in `folder` with their table."""
     from agentspec.episode import Job, Runner
     from agentspec.files import write_atomic
     from trainers.policy import load_actor_and_reflector

@@ -73,7 +73,7 @@ def add_parser(commands: Any) -> None:
     )
     group.add_argument("--plot", action="store_true", help="write matrix.png")
     group.add_argument("--json", action="store_true", help="print the summary as JSON instead of tables")
-    parser.set_defaults(command=run)
+    parser.set_defaults(command=run, out_resumes=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
