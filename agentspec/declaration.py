@@ -68,6 +68,7 @@ class Declaration:
         small: for the contract tests, sets of parameters under which, together, everything the method does fires
             within a dozen steps.
         small_calls: the call profile under each of `small`; `None`: as `calls`.
+        scope: `run` for a method that is of no use within one episode: a spec with another scope is refused.
         name: name in a spec; empty: the name of the file in this package, outside it the class's name in snake case.
         aliases: other names.
     """
@@ -81,6 +82,7 @@ class Declaration:
     envs: tuple[str, ...] = ()
     small: tuple[Mapping[str, Any], ...] = ()
     small_calls: CallProfile | None = None
+    scope: str = ""
     name: str = ""
     aliases: tuple[str, ...] = ()
 

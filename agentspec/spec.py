@@ -147,6 +147,13 @@ class AgentSpec:
         for key, lowest in (("max_turns", 0), ("recall_tokens", 0), ("lesson_tokens", 0)):
             if getattr(self, key) < lowest:
                 raise SpecError(f"{key} must be at least {lowest}, got {getattr(self, key)}")
+        for kind in MODULE_KINDS:
+            module: ModuleSpec = getattr(self, kind)
+            if REGISTRY.get(kind, module.name).declaration.scope not in ("", self.scope):
+                raise SpecError(
+                    f"{kind} {module.name!r} learns from one episode for the next, but `scope: {self.scope}` ends with "
+                    "each; set `scope: run`, or choose another module"
+                )
         self._check_roles()
         if self.embedder:
             from agentspec.embedding import check_embedder

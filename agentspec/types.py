@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from agentspec.tokens import clip_text, estimate_tokens
@@ -45,11 +45,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One argument of an action: its type name, whether it must be given, and the allowed values if they are few."""
+    """One argument of an action: its type name, whether it must be given, and the allowed values if they are few.
+
+    Args:
+        default: what leaving it out means (`None`: nothing in particular).
+        resolution: smallest difference that matters to the environment, in the schema's base unit (0: all do).
+    """
 
     type: Literal["int", "float", "str", "list", "any"] = "any"
     required: bool = True
     enum: tuple[str, ...] = ()
+    default: Any = None
+    resolution: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -227,22 +234,33 @@ class Sampling:
     """How to sample. ``choices`` constrains the whole completion to one of the given texts.
 
     ``temperature`` 0 is greedy. ``top_p`` 1 and ``top_k`` 0 are off. ``stop`` strings end a completion and are cut
-    from its text (their tokens stay in ``token_ids``).
+    from its text (their tokens stay in ``token_ids``). ``reasoning_tokens`` is room for hidden reasoning on top of
+    ``max_tokens``, for models that think before they answer: a free answer may have both together. Answers bound to
+    ``choices`` hold no reasoning.
     """
 
     temperature: float = 1.0
     top_p: float = 1.0
     top_k: int = 0
-    max_tokens: int = 256
+    max_tokens: int = 1024
     stop: tuple[str, ...] = ()
     n: int = 1
     choices: tuple[str, ...] = ()
+    reasoning_tokens: int = 0
+
+    def with_room(self) -> Sampling:
+        """The same with the room for reasoning made part of ``max_tokens``: what a backend is asked for."""
+        if not self.reasoning_tokens:
+            return self
+        room = self.max_tokens + (0 if self.choices else self.reasoning_tokens)
+        return replace(self, max_tokens=room, reasoning_tokens=0)
 
     def __post_init__(self) -> None:
-        if self.temperature < 0 or not 0 < self.top_p <= 1 or self.top_k < 0 or self.max_tokens < 1 or self.n < 1:
+        bad = self.temperature < 0 or not 0 < self.top_p <= 1 or self.top_k < 0 or self.max_tokens < 1 or self.n < 1
+        if bad or self.reasoning_tokens < 0:
             raise ValueError(
                 f"sampling parameters out of range: {self}; expected temperature >= 0, 0 < top_p <= 1, top_k >= 0, "
-                "max_tokens >= 1, n >= 1"
+                "max_tokens >= 1, n >= 1, reasoning_tokens >= 0"
             )
 
 

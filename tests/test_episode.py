@@ -166,7 +166,9 @@ def test_a_reflection_that_fails_touches_its_own_episode_only(fault: str) -> Non
             raise LLMError("no answer from the model")
         raise ContextOverflowError("the trial is too long")
 
-    spec = AgentSpec.from_data({"reasoning": "direct", "reflection": {"name": "reflexion", "threshold": 100.0}})
+    spec = AgentSpec.from_data(
+        {"reasoning": "direct", "reflection": {"name": "reflexion", "threshold": 100.0}, "scope": "run"}
+    )
     played = Runner(spec, ScriptedLLM(script)).run([Job(Task(TOY, seed)) for seed in range(12)])
     wrote = [any(c.tag.purpose == "reflect" for c in t.calls) for t in played]
     assert any(wrote) and not all(wrote)

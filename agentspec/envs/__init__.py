@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    "agentspec/MiniGrid-v0": "agentspec.envs.minigrid.env:MiniGridEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
 
@@ -71,4 +72,10 @@ register(
     "deliverybench",
     "agentspec/DeliveryBench-v0",
     "a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+)
+register(
+    "env",
+    "minigrid",
+    "agentspec/MiniGrid-v0",
+    "MiniGrid and BabyAI grids: egocentric text, success within 100 steps, the paper's ten tasks",
 )

@@ -198,12 +198,13 @@ def _offers(env: Any, seed: int, steps: int) -> Iterator[str]:
             parsed = parse_action(example, ActionSchema(schema.actions, schema.aliases, schema.units))
             if not isinstance(parsed, Action) or parsed.name != name:
                 yield f"the example {example!r} of action {name} does not read as it"
-    text = env.reset(seed=seed)[0].get("text", "")
+    shown, told = env.reset(seed=seed)
+    text = f"{shown.get('text', '')}\n{told.get('instruction', '')}"
     for number, choice in enumerate(schema.choices):
         if not isinstance(parse_action(choice, schema), Action):
             yield f"the menu's {choice!r} does not read as an action"
         if choice not in text:
-            yield f"the menu's {choice!r} does not stand in the observation's text"
+            yield f"the menu's {choice!r} stands neither in the observation's text nor in the instruction"
         _, again = env.reset(seed=seed)
         told = env.step(again["action_schema"].choices[number])[4]
         if told["invalid"]:

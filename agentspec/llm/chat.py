@@ -54,7 +54,8 @@ class ChatFormat:
 
     Args:
         tokenizer: a Hugging Face tokenizer (anything with its ``apply_chat_template`` and ``encode``).
-        template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
+        template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``; by default those that
+            :func:`set_template_kwargs` gave the tokenizer.
 
     Attributes:
         end_of_turn: id of the token that ends an assistant turn, or ``None`` if there is none.
@@ -63,7 +64,7 @@ class ChatFormat:
 
     def __init__(self, tokenizer: Any, template_kwargs: Mapping[str, Any] | None = None) -> None:
         self.tokenizer = tokenizer
-        self._kwargs = dict(template_kwargs or {})
+        self._kwargs = dict(getattr(tokenizer, _KWARGS, {}) if template_kwargs is None else template_kwargs)
         if not getattr(tokenizer, "chat_template", None):
             self._kwargs["chat_template"] = FALLBACK_TEMPLATE
         added = [t for t in getattr(tokenizer, "added_tokens_decoder", {}).values() if t.special and t.content]
@@ -215,6 +216,19 @@ class ChatFormat:
         ids = self._encode_literal(pieces[-1]) if len(pieces) > 1 else ()
         special = {i for i, t in getattr(self.tokenizer, "added_tokens_decoder", {}).items() if t.special}
         return ids[0] if ids and ids[0] in special else eos
+
+
+_KWARGS = "agentspec_template_kwargs"
+
+
+def set_template_kwargs(tokenizer: Any, template_kwargs: Mapping[str, Any]) -> None:
+    """Give ``tokenizer`` variables of its chat template, for every prompt that is rendered with it from now on.
+
+    The backends of a trainer render with the trainer's tokenizer, so what is set here (``{"enable_thinking": False}``)
+    reaches sampling on every backend, demonstrations and the training forward alike.
+    """
+    setattr(tokenizer, _KWARGS, dict(template_kwargs))
+    _FORMATS.pop(tokenizer, None)
 
 
 _FORMATS: weakref.WeakKeyDictionary[Any, ChatFormat] = weakref.WeakKeyDictionary()

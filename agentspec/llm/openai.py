@@ -8,6 +8,11 @@ and continues an assistant turn. (vLLM reports log-probabilities of the unmodifi
 Choices without server support: the model answers freely; an answer that equals one of the choices up to case, space and
 punctuation is taken as that choice, and any other is returned as it is, for the parser of actions to report.
 
+Models that reason do not take every parameter of the protocol. Which ones an endpoint rejects is learnt from its 400
+answer: the parameter is left out from then on, with one note in the log, and stands in :attr:`OpenAILLM.rejected`; a
+method that needs it (samples that vote need a temperature) refuses to go on with that reason. ``max_tokens`` becomes
+``max_completion_tokens`` in the same way, ``n`` becomes as many requests, stop strings are cut afterwards.
+
 Failures that may pass (429, 5xx, time-outs, broken connections) are tried again after a growing, jittered pause, or
 the one the server asks for; the jitter comes from the request's seed. Others are raised at once with what to do about
 them.
@@ -17,6 +22,7 @@ from __future__ import annotations
 
 import asyncio
 import email.utils
+import logging
 import os
 import random
 import re
@@ -31,6 +37,16 @@ from agentspec.types import Completion, LLMCall, Usage
 _DEFAULT_URL = "https://api.openai.com/v1"
 _RETRIED = frozenset({408, 409, 429, 500, 502, 503, 504, 529})
 _LONGEST_PAUSE_S = 60.0
+_LEARNT = -1.0  # in place of a pause: the request was mended and is made again at once
+_OPTIONAL = ("temperature", "top_p", "stop", "n", "seed", "logprobs", "presence_penalty", "chat_template_kwargs")
+"""Parameters a request can do without, in the order in which they are looked for in a refusal."""
+
+_REFUSED = re.compile(
+    r"unsupported|not supported|does not support|unrecognized|unknown|not permitted|extra inputs|unexpected|only the "
+    r"default|deprecated|not allowed|must be 1\b|invalid.{0,20}(parameter|value)|not compatible",
+    re.IGNORECASE,
+)
+_LOG = logging.getLogger(__name__)
 _CONTEXT = re.compile(r"context.{0,20}(length|window)|maximum.{0,20}(context|tokens)|too many (input )?tokens", re.I)
 
 
@@ -47,6 +63,8 @@ class OpenAILLM:
             versions before 0.12.
         max_tokens_key: ``max_completion_tokens`` for OpenAI's reasoning models.
         extra_body: further fields of every request.
+        template_kwargs: variables of the server's chat template (``{"enable_thinking": False}``), sent as
+            ``chat_template_kwargs``, which vLLM and SGLang know.
         timeout_s: per attempt.
         max_retries: attempts after the first.
         max_concurrency: requests in flight at once.
@@ -65,6 +83,7 @@ class OpenAILLM:
         choices: Literal["structured_outputs", "guided_choice"] = "structured_outputs",
         max_tokens_key: Literal["max_tokens", "max_completion_tokens"] = "max_tokens",
         extra_body: Mapping[str, Any] | None = None,
+        template_kwargs: Mapping[str, Any] | None = None,
         timeout_s: float = 120.0,
         max_retries: int = 6,
         max_concurrency: int = 16,
@@ -87,6 +106,9 @@ class OpenAILLM:
         self._choices = choices
         self._max_tokens_key = max_tokens_key
         self._extra = dict(extra_body or {})
+        if template_kwargs:
+            self._extra["chat_template_kwargs"] = dict(template_kwargs)
+        self.rejected: dict[str, str] = {}
         self._timeout = timeout_s
         self._retries = max_retries
         self._concurrency = max_concurrency
@@ -172,10 +194,36 @@ class OpenAILLM:
                 body |= {"structured_outputs": {"choice": listed}} if native else {"guided_choice": listed}
             if request.messages[-1].role == "assistant":
                 body |= {"continue_final_message": True, "add_generation_prompt": False}
-        return body | self._extra
+        body |= self._extra
+        return {key: value for key, value in body.items() if key not in self.rejected}
+
+    def _learn(self, problem: str, body: dict[str, Any]) -> bool:
+        """Whether a refusal names a parameter that can be left out or renamed; it is, from now on."""
+        if "max_completion_tokens" in problem and "max_tokens" in body:
+            self._max_tokens_key = "max_completion_tokens"
+            body["max_completion_tokens"] = body.pop("max_tokens")
+            return True
+        if not _REFUSED.search(problem):
+            return False
+        for name in _OPTIONAL:
+            if name in body and re.search(rf"\b{name}\b", problem):
+                self.rejected.setdefault(name, problem)
+                del body[name]
+                _LOG.warning(
+                    "%s at %s does not take `%s` (%s); it is left out from now on",
+                    self.name,
+                    self.base_url,
+                    name,
+                    problem,
+                )
+                return True
+        return False
 
     def _completion(self, choice: Mapping[str, Any], request: Request) -> Completion:
         text = (choice.get("message") or {}).get("content") or ""
+        if "stop" in self.rejected:
+            cuts = [text.index(stop) for stop in request.sampling.stop if stop in text]
+            text = text[: min(cuts)] if cuts else text
         ids = tuple(choice.get("token_ids") or ())
         entries = (choice.get("logprobs") or {}).get("content") or ()
         logprobs = tuple(float(e["logprob"]) for e in entries)
@@ -198,6 +246,8 @@ class OpenAILLM:
         for attempt in range(self._retries + 1):
             async with self._slots:
                 answer, problem, pause = await self._attempt(body)
+                while answer is None and pause == _LEARNT:
+                    answer, problem, pause = await self._attempt(body)
             if answer is not None:
                 return answer
             if attempt < self._retries:
@@ -208,7 +258,7 @@ class OpenAILLM:
             "Check the server, or raise `max_retries` or `timeout_s`, or lower `max_concurrency`"
         )
 
-    async def _attempt(self, body: Mapping[str, Any]) -> tuple[dict[str, Any] | None, str, float]:
+    async def _attempt(self, body: dict[str, Any]) -> tuple[dict[str, Any] | None, str, float]:
         """The answer, or why there is none yet and how long the server asks to wait."""
         httpx = import_httpx()
         try:
@@ -219,6 +269,8 @@ class OpenAILLM:
             return None, f"the connection failed ({error or type(error).__name__})", 0.0
         if response.status_code != 200:
             problem = self._redact(f"HTTP {response.status_code}: {_message(response)}")
+            if response.status_code in (400, 422) and self._learn(problem, body):
+                return None, problem, _LEARNT
             if response.status_code not in _RETRIED or "insufficient_quota" in response.text:
                 raise self._refusal(response.status_code, problem)
             return None, problem, _retry_after(response.headers.get("retry-after"))

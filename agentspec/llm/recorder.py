@@ -110,7 +110,7 @@ class Recorder:
         call_id, self._next_id = self._next_id, self._next_id + 1
         request = Request(
             messages=tuple(messages),
-            sampling=replace(self.sampling, **overrides),
+            sampling=replace(self.sampling, **overrides).with_room(),
             tag=CallTag(module, purpose, self.episode, self.step, branch),
             seed=derive_seed(self.seed, call_id),
             id=call_id,

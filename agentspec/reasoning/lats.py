@@ -1,13 +1,19 @@
 """LATS, language agent tree search (Zhou et al., 2024): Monte-Carlo tree search in the environment itself.
 
-A node is an action and what the *real* environment answered to it: steps are tried, the environment is put back by a
-snapshot, and after the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with samples
-of the policy, lets a judge value the new states, goes on from the best one (to the end, or not at all with
-``rollout="value"``), and back-propagates the rewards on the way plus the last state's value. A path that ends without
+A node is a thought, an action and what the *real* environment answered to it: steps are tried, the environment is put
+back by a snapshot, and after the decision it is exactly as it was. One iteration selects a leaf by UCT, expands it with
+samples of the policy, lets a judge value the new states, goes on from the best one (to the end, or not at all with
+`rollout="value"`), and back-propagates the rewards on the way plus the last state's value. A path that ends without
 success is reflected on in words, and later proposals and judgements are shown these lessons. A success ends the search.
 
-Without snapshots the method is not LATS: it is refused, or, with ``world="model"``, the model predicts what would be
-observed, as in RAP, and the trace says ``world: model``.
+Rewards are brought to the unit interval of the judge's values by the environment's declared `typical_return` (and cut
+off at -1 and 1 per step), and a path counts as a success where the environment says so or its return reaches that
+scale: one dollar is neither worth ten good judgements nor the end of the search.
+
+Cost per step at the paper's size: up to a thousand calls; preset `rl`: at most 22.
+
+Without snapshots the method is not LATS: it is refused, or, with `world="model"`, the model predicts what would be
+observed, as in RAP, and the trace says `world: model`.
 """
 
 from __future__ import annotations
@@ -19,19 +25,20 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
-from agentspec.protocols import Services
-from agentspec.reasoning.common import (
+from agentspec.metrics import typical_return
+from agentspec.parameters import at_least, one_of, settings
+from agentspec.prompting import (
+    MAX_RETRIES,
     ON_REQUEST,
-    at_least,
     clip,
-    one_of,
-    settings,
+    require_variety,
     static_prompt,
     user_turn,
     with_request,
 )
+from agentspec.protocols import Services
 from agentspec.reasoning.search.judge import RATE, UNREAD, rate
-from agentspec.reasoning.search.meter import Meter, OutOfBudgetError
+from agentspec.reasoning.search.meter import Meter, OutOfBudgetError, last_resort
 from agentspec.reasoning.search.propose import legal, sample_steps
 from agentspec.reasoning.search.tree import Node, backpropagate, close, nodes_where, select
 from agentspec.reasoning.search.world import ModelWorld, RealWorld, World, render_steps, root_outcome
@@ -81,30 +88,32 @@ class LanguageAgentTreeSearch:
     """Monte-Carlo tree search in the real environment.
 
     Args:
-        preset: ``paper`` (30 iterations, depth 7, 5 samples and 10 at the root, simulation to the end; for evaluation:
-            up to 10**3 calls per decision) or ``rl`` (4 iterations, depth 3, 3 samples, value instead of simulation).
+        preset: `paper` (30 iterations, depth 7, 5 samples and 10 at the root, simulation to the end; for evaluation:
+            up to 10**3 calls per decision) or `rl` (4 iterations, depth 3, 3 samples, value instead of simulation).
         num_iterations, max_depth: size of the search.
         n_generate_sample, root_samples: samples per expansion, and of the root.
-        rollout: ``simulate`` (follow the best value to an end or the depth limit) or ``value`` (trust the judge).
+        rollout: `simulate` (follow the best value to an end or the depth limit) or `value` (trust the judge).
         exploration: weight w of UCT.
         mix: share of the judge's rating in a state's value (the paper's lambda); the rest is the share of samples.
         evaluations: ratings per state, averaged.
-        success_return: an ended path is a success from this return on, where the environment reports no ``success``.
-        reward_scale: factor on rewards, to bring them to the scale of values (0 to 1).
+        success_return: an ended path is a success from this return on, where the environment reports no `success`
+            (`None`: its `typical_return`).
+        reward_scale: factor on rewards, to bring them to the scale of values (`None`: 1 / `typical_return`).
         max_reflections: lessons kept in an episode (0: none are made).
-        world: ``environment`` or ``model``, see the module's docstring.
+        world: `environment` or `model`, see the module's docstring.
         temperature: of proposals.
-        max_calls: most requests per decision (``None``: no limit).
-        max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
-        path_tokens, lesson_tokens: budgets of prompt sections.
+        max_calls: most requests per decision (`None`: no limit).
+        max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
+        path_tokens, lesson_tokens: budgets of prompt sections; of a path only observations are clipped.
         prediction_tokens: most tokens of a predicted observation, of a rating in words, and of a reflection.
-        thought_tokens: most tokens of a proposal (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a proposal (`None`: the spec's `max_tokens`).
+        max_retries: further calls if nothing that was proposed is an action.
     """
 
     declaration = Declaration(
         "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
-        calls=CallProfile(step=(1, 1121)),
-        rl=CallProfile(step=(1, 20)),
+        calls=CallProfile(step=(1, 1123)),
+        rl=CallProfile(step=(1, 22)),
         purposes=Purpose.each("step", "propose", "value", "reflect", "world"),
         needs=("n", "snapshots"),
         waived={"snapshots": ("world", "model")},
@@ -122,8 +131,8 @@ class LanguageAgentTreeSearch:
         exploration: float = 1.0,
         mix: float = 0.5,
         evaluations: int = 1,
-        success_return: float = 1.0,
-        reward_scale: float = 1.0,
+        success_return: float | None = None,
+        reward_scale: float | None = None,
         max_reflections: int = 3,
         world: str = "environment",
         temperature: float = 1.0,
@@ -133,6 +142,7 @@ class LanguageAgentTreeSearch:
         lesson_tokens: int = 192,
         prediction_tokens: int | None = None,
         thought_tokens: int | None = None,
+        max_retries: int = MAX_RETRIES,
     ) -> None:
         given: dict[str, Any] = {
             "num_iterations": num_iterations,
@@ -153,7 +163,11 @@ class LanguageAgentTreeSearch:
         self.iterations, self.depth = chosen["num_iterations"], chosen["max_depth"]
         self.samples, self.root_samples = chosen["n_generate_sample"], chosen["root_samples"]
         self.exploration, self.mix, self.evaluations = exploration, mix, evaluations
-        self.success_return, self.reward_scale = success_return, reward_scale
+        at_least("lats", 0, max_retries=max_retries)
+        require_variety("lats", services, temperature)
+        self.max_retries = max_retries
+        self._given_success, self._given_scale = success_return, reward_scale
+        self.success_return, self.reward_scale = success_return or 1.0, reward_scale or 1.0
         self.max_reflections = max_reflections
         self.world = world
         self.temperature = temperature
@@ -167,7 +181,7 @@ class LanguageAgentTreeSearch:
         """Forget the lessons of the last episode.
 
         Raises:
-            SpecError: the environment cannot be put back and ``world`` is not ``model``.
+            SpecError: the environment cannot be put back and `world` is not `model`.
         """
         if self.world == "environment" and self.services.simulator is None:
             raise SpecError(
@@ -175,6 +189,9 @@ class LanguageAgentTreeSearch:
                 "restore(); set `world: model` to search in predictions, or choose another reasoning module"
             )
         self._lessons = []
+        scale = typical_return(task.env)
+        self.success_return = scale if self._given_success is None else self._given_success
+        self.reward_scale = 1 / scale if self._given_scale is None else self._given_scale
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services)
@@ -193,7 +210,9 @@ class LanguageAgentTreeSearch:
                 await self._search(search, root)
             finally:
                 await simulator.restore(blob)
-        return self._decision(search, root, input)
+        trace = self._trace(search, root)
+        decision = self._decision(search, root, input, trace)
+        return decision or await last_resort(meter, base, input.action_schema, trace, self.max_retries)
 
     def _imagined(self, meter: Meter, base: Sequence[Message]) -> World:
         return ModelWorld(
@@ -233,7 +252,7 @@ class LanguageAgentTreeSearch:
         return node.terminal or node.depth >= self.depth
 
     async def _descend(self, search: Search, path: list[Node]) -> bool:
-        """Expand the last node of ``path`` and go on to its best child; ``False`` if there is none."""
+        """Expand the last node of `path` and go on to its best child; `False` if there is none."""
         node = path[-1]
         if self._over(node):
             return False
@@ -252,7 +271,7 @@ class LanguageAgentTreeSearch:
         return self._return(node) >= self.success_return
 
     def _return(self, node: Node) -> float:
-        """Rewards from the root to ``node``, in the environment's own scale."""
+        """Rewards from the root to `node`, in the environment's own scale."""
         return sum(n.state.reward for n in node.path[1:])
 
     async def _expand(self, search: Search, node: Node) -> None:
@@ -278,7 +297,7 @@ class LanguageAgentTreeSearch:
             child.prior = child.note.count / wanted
         for child in children:
             child.state = await search.world.step(child)
-            child.reward = child.state.reward * self.reward_scale
+            child.reward = max(-1.0, min(1.0, child.state.reward * self.reward_scale))
             child.terminal = child.state.ended
         await self._judge(search, children, wanted)
         for child in children:
@@ -286,7 +305,7 @@ class LanguageAgentTreeSearch:
                 close(child)
 
     async def _judge(self, search: Search, children: Sequence[Node], wanted: int) -> None:
-        """Value of each state that is no end: ``mix`` of the judge's rating (0 to 1) and the share of samples."""
+        """Value of each state that is no end: `mix` of the judge's rating (0 to 1) and the share of samples."""
         alive = [child for child in children if not child.terminal]
         for child in children:
             child.prior = child.reward
@@ -301,7 +320,7 @@ class LanguageAgentTreeSearch:
         search.meter.stop()
 
     def _request(self, node: Node, form: str) -> str:
-        """Lessons, the steps up to ``node`` with what came of them, and what is asked."""
+        """Lessons, the steps up to `node` with what came of them, and what is asked."""
         parts = []
         if self._lessons:
             lessons = "\n".join(f"- {lesson}" for lesson in self._lessons)
@@ -319,7 +338,7 @@ class LanguageAgentTreeSearch:
         if lesson:
             self._lessons = [*self._lessons, lesson][-self.max_reflections :]
 
-    def _decision(self, search: Search, root: Node, input: AgentInput) -> Decision:
+    def _trace(self, search: Search, root: Node) -> dict[str, Any]:
         children = root.children or []
         trace: dict[str, Any] = {
             "method": "lats",
@@ -330,13 +349,17 @@ class LanguageAgentTreeSearch:
         }
         if search.unread:
             trace["unread_ratings"] = search.unread
+        return trace
+
+    def _decision(self, search: Search, root: Node, input: AgentInput, trace: dict[str, Any]) -> Decision | None:
+        children = root.children or []
         # A success first, then what the search came to; untried ones only if nothing was tried.
         solved = nodes_where(root, self._success)
         tried = [c for c in children if c.visits] or children
         best = solved[0].first if solved else max(tried, key=lambda c: (c.value, c.visits), default=None)
         action = legal(best.action, input.action_schema) if best else None
         if best is None or action is None:
-            return search.meter.undecided(trace)
+            return None
         return Decision(
             action,
             rationale=best.note.thought,

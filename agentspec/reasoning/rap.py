@@ -2,12 +2,20 @@
 
 The model plays two parts: policy and judge propose actions and say how good they are, and the world model predicts
 what each would lead to. An action's fast reward, known before it is tried, is
-``alpha * (log p(action | prompt) + log p("good" | its judgement))``; once the world model has predicted its result, the
-reward adds ``(1 - alpha) * goal_reward`` if the goal is reached there. The search is :mod:`.search.mcts`: UCT over mean
+`alpha * (log p(action | prompt) + log p("good" | its judgement))`; once the world model has predicted its result, the
+reward adds `(1 - alpha) * goal_reward` if the goal is reached there. The search is `.search.mcts`: UCT over mean
 returns, lazy states, simulation by fast reward, back-propagation; the answer is the path with the greatest sum.
 
-The first action of that path is executed. Log-probabilities need a backend that scores; ``evaluation="samples"`` counts
-samples instead. Nothing is executed while it searches: all states but the root's are imagined.
+The paper's problems are puzzles whose paths are equally long and pay only at the goal. For agents three things differ.
+Ending earns nothing by itself: a sum of negative log-probabilities would reward the path that dies first, so an end
+without the goal is charged, at its own rate, for the steps that were left and one more. What the world model says a
+step earns (in the environment's unit, divided by the environment's `typical_return`) enters as a share of the goal's
+reward. And with `reward="normalised"` (preset `rl`) log p(action) is taken per token, so that long calls are not the
+worse ones for their length. With `reward="paper"` and a model that predicts no earnings the numbers are the paper's.
+
+The first action of the best path is executed. Log-probabilities need a backend that scores; `evaluation="samples"`
+counts samples instead. Nothing is executed while it searches: all states but the root's are imagined. Cost per step: at
+most one proposal and one prediction per new node, and a scoring per proposed action.
 """
 
 from __future__ import annotations
@@ -19,28 +27,22 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
+from agentspec.metrics import typical_return
+from agentspec.parameters import at_least, one_of, settings
+from agentspec.prompting import MAX_RETRIES, ON_REQUEST, static_prompt, user_turn, with_request
 from agentspec.protocols import Services
-from agentspec.reasoning.common import (
-    ON_REQUEST,
-    Stateless,
-    at_least,
-    one_of,
-    settings,
-    static_prompt,
-    user_turn,
-    with_request,
-)
+from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.search import mcts
 from agentspec.reasoning.search.judge import last_word
-from agentspec.reasoning.search.meter import Ask, Meter, OutOfBudgetError
+from agentspec.reasoning.search.meter import Ask, Meter, OutOfBudgetError, last_resort
 from agentspec.reasoning.search.propose import Proposal, legal, sample_steps
 from agentspec.reasoning.search.tree import Node, best_leaf
 from agentspec.reasoning.search.world import ModelWorld, render_steps, root_outcome
-from agentspec.types import ActionSchema, AgentInput, Decision, Recall
+from agentspec.types import ActionSchema, AgentInput, Decision, Recall, Task
 
 PRESETS = {
-    "paper": {"num_iterations": 10, "depth": 5, "num_actions": 4, "prediction_tokens": 128},
-    "rl": {"num_iterations": 3, "depth": 3, "num_actions": 3, "prediction_tokens": 48},
+    "paper": {"num_iterations": 10, "depth": 5, "num_actions": 4, "prediction_tokens": 128, "reward": "paper"},
+    "rl": {"num_iterations": 3, "depth": 3, "num_actions": 3, "prediction_tokens": 64, "reward": "normalised"},
 }
 NEXT = "{steps}Write the one action that should come next."
 JUDGE = "{steps}The next action would be: {action}\nIs that a good step towards the task's goal? Answer good or bad."
@@ -68,9 +70,16 @@ class ImaginedProblem:
 
     async def visit(self, node: Node) -> None:
         """Predict what the action leads to; the reward adds the goal's to the fast reward."""
+        method = self._method
         outcome = await self._world.step(node)
         node.state, node.terminal = outcome, outcome.ended
-        node.reward = node.prior + (1 - self._method.alpha) * self._method.goal_reward * outcome.reward
+        steps = 1
+        if outcome.ended and not outcome.reward:
+            # Ending earns nothing by itself: the steps that were left, and one more, cost what this one does.
+            steps += max(0, method.depth - node.depth) + 1
+        earned = outcome.reward or outcome.earned / method.scale
+        node.reward = steps * min(0.0, node.prior) + max(0.0, node.prior)
+        node.reward += (1 - method.alpha) * method.goal_reward * earned
 
     async def actions(self, node: Node) -> list[Node]:
         """Sampled actions with their fast rewards."""
@@ -102,6 +111,10 @@ class ImaginedProblem:
             texts = [p.text for p in proposals]
             asked = [(with_request(self._base, request), texts), *((messages, ["good"]) for messages in judged)]
             likely, *good = await self._meter.score_all(asked)
+            if method.normalised:
+                likely = tuple(
+                    a / max(1, method.services.llm.count_tokens(t)) for a, t in zip(likely, texts, strict=True)
+                )
             return [method.alpha * (a + g[0]) for a, g in zip(likely, good, strict=True)]
         sampling: dict[str, Any] = {"n": method.eval_samples, "temperature": 1.0}
         if self._schema.choices and self._meter.constrains:
@@ -122,29 +135,31 @@ class ReasoningViaPlanning(Stateless):
     """Monte-Carlo tree search in the model's imagination.
 
     Args:
-        preset: ``paper`` (10 iterations, depth 5, 4 actions) or ``rl`` (3, 3, 3, short predictions).
+        preset: `paper` (10 iterations, depth 5, 4 actions) or `rl` (3, 3, 3, short predictions).
         num_iterations: paths sampled per decision.
         depth: most steps of a path.
         num_actions: actions sampled per state.
         exploration: weight w of UCT.
         alpha: share of the model's own judgement in the reward; the rest is the goal's.
         goal_reward: what reaching the goal counts, on the scale of log-probabilities.
-        evaluation: ``score`` (log-probabilities) or ``samples`` (Monte-Carlo, for backends that cannot score).
-        eval_samples: samples of a judgement under ``samples``.
-        output: the path that decides: ``max_reward`` (greatest sum), ``max_visits`` (most visited child at each level)
-            or ``max_iter`` (the best single iteration).
+        reward: `paper` (log p of the whole action) or `normalised` (per token).
+        evaluation: `score` (log-probabilities) or `samples` (Monte-Carlo, for backends that cannot score).
+        eval_samples: samples of a judgement under `samples`.
+        output: the path that decides: `max_reward` (greatest sum), `max_visits` (most visited child at each level)
+            or `max_iter` (the best single iteration).
         temperature: of proposals and predictions.
-        max_calls: most requests and scorings per decision (``None``: no limit).
-        max_search_tokens: tokens after which a decision makes no further request (``None``: no limit).
+        max_calls: most requests and scorings per decision (`None`: no limit).
+        max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
         path_tokens: budgets of prompt sections.
         prediction_tokens: most tokens of a predicted observation.
-        thought_tokens: most tokens of a proposed action (``None``: the spec's ``max_tokens``).
+        thought_tokens: most tokens of a proposed action (`None`: the spec's `max_tokens`).
+        max_retries: further calls if nothing that was proposed is an action.
     """
 
     declaration = Declaration(
         "Monte-Carlo tree search with the model as world model and judge",
-        calls=CallProfile(step=(1, 91)),
-        rl=CallProfile(step=(1, 16)),
+        calls=CallProfile(step=(1, 93)),
+        rl=CallProfile(step=(1, 18)),
         purposes=Purpose.each("step", "propose", "world", "judge"),
         needs=("n", "score"),
         waived={"score": ("evaluation", "samples")},
@@ -164,6 +179,7 @@ class ReasoningViaPlanning(Stateless):
         exploration: float = 1.0,
         alpha: float = 0.5,
         goal_reward: float = 100.0,
+        reward: str | None = None,
         evaluation: str = "score",
         eval_samples: int = 3,
         output: str = "max_reward",
@@ -173,14 +189,21 @@ class ReasoningViaPlanning(Stateless):
         path_tokens: int = 512,
         prediction_tokens: int | None = None,
         thought_tokens: int | None = None,
+        max_retries: int = MAX_RETRIES,
     ) -> None:
         given = {
             "num_iterations": num_iterations,
             "depth": depth,
             "num_actions": num_actions,
             "prediction_tokens": prediction_tokens,
+            "reward": reward,
         }
-        chosen: dict[str, int] = settings("rap", PRESETS, preset, given)
+        chosen: dict[str, Any] = settings("rap", PRESETS, preset, given)
+        one_of("rap", reward=(chosen["reward"], ("paper", "normalised")))
+        self.normalised = chosen.pop("reward") == "normalised"
+        at_least("rap", 0, max_retries=max_retries)
+        self.max_retries = max_retries
+        self.scale = 1.0
         at_least("rap", 1, max_calls=max_calls, eval_samples=eval_samples, **chosen)
         one_of(
             "rap",
@@ -198,6 +221,10 @@ class ReasoningViaPlanning(Stateless):
         self.path_tokens = path_tokens
         self.prediction_tokens = chosen["prediction_tokens"]
         self.limit: dict[str, Any] = {} if thought_tokens is None else {"max_tokens": thought_tokens}
+
+    def begin_episode(self, task: Task) -> None:
+        """Take the environment's scale of returns."""
+        self.scale = typical_return(task.env)
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services)
@@ -220,7 +247,7 @@ class ReasoningViaPlanning(Stateless):
         leaf = self._output(root, record)
         action = legal(leaf.first.action, input.action_schema) if leaf else None
         if leaf is None or action is None:
-            return meter.undecided(trace)
+            return await last_resort(meter, base, input.action_schema, trace, self.max_retries)
         children = root.children or []
         return Decision(
             action,

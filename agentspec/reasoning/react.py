@@ -1,23 +1,37 @@
 """ReAct (Yao et al., 2023): thought, action and observation in one growing transcript.
 
-A thought is a turn of its own that the scaffold acknowledges; it uses a step of the loop and none of the environment.
-With free-text actions one completion may hold thought and action; an answer without an action is a thought, and after
-``max_iterations`` of those the next call is asked for the action alone. In menu mode a thought is followed by the
-action, decoded under the menu's constraint. A completion never writes observations: it is stopped where it begins one.
+In the paper a thought is an action of its own that the environment answers with nothing. Here a thought is a turn that
+the scaffold acknowledges; it uses a step of the loop and none of the environment. With free-text actions one completion
+usually holds thought and action, one call per step: any answer that reads as an action is one, however it is dressed.
+An answer without one is a thought, and after `max_iterations` of those the action is asked for alone. An action that
+cannot be read is asked for again (`max_retries`). In menu mode a thought is followed by the action, decoded under the
+menu's constraint: two calls per step. A completion never writes observations: it is stopped where it begins one.
 
-In the ``conversation`` layout the transcript is the context itself; in ``snapshot`` it is rendered into the user turn.
+In the `conversation` layout the transcript is the context itself; in `snapshot` it is rendered into the user turn.
 """
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 
-from agentspec.actions import parse_action
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.protocols import Services
-from agentspec.reasoning.common import ask_action, default_answer, last_action_line, sampled, static_prompt, user_turn
+from agentspec.llm.base import Message
+from agentspec.parameters import at_least
+from agentspec.prompting import (
+    MAX_RETRIES,
+    Acted,
+    ask_action,
+    complaint,
+    default_answer,
+    read_call,
+    sampled,
+    static_prompt,
+    user_turn,
+)
+from agentspec.reading import read, visible
+from agentspec.services import Services
 from agentspec.state import dump_state, load_state
-from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task, Transition
+from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
 
 FORMAT = (
     "Work in turns. Write what you think in one or two sentences after 'Thought:', then one line "
@@ -36,13 +50,14 @@ class ReAct:
 
     Args:
         max_iterations: consecutive thoughts before the action is asked for alone.
-        thought_tokens: most tokens of a thought (``None``: the spec's ``max_tokens``).
-        history: steps of transcript shown in the ``snapshot`` layout.
+        thought_tokens: most tokens of a thought (`None`: the spec's `max_tokens`).
+        history: steps of transcript shown in the `snapshot` layout.
+        max_retries: further calls for an action that cannot be read.
     """
 
     declaration = Declaration(
         "a growing transcript of thought, action and observation",
-        calls=CallProfile(step=(1, 11)),
+        calls=CallProfile(step=(1, 13)),
         purposes=Purpose.each("step", "think", "act"),
     )
 
@@ -52,55 +67,76 @@ class ReAct:
         max_iterations: int = 10,
         thought_tokens: int | None = None,
         history: int = 10,
+        max_retries: int = MAX_RETRIES,
     ) -> None:
-        if max_iterations < 1:
-            raise ValueError(f"react: max_iterations must be at least 1, got {max_iterations}")
+        at_least("react", 1, max_iterations=max_iterations, history=history)
+        at_least("react", 0, max_retries=max_retries)
         self.services = services
         self.max_iterations = max_iterations
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self.history = history
+        self.max_retries = max_retries
         self._transcript: list[str] = []
 
     def begin_episode(self, task: Task) -> None:
         self._transcript = []
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
-        schema = input.action_schema
-        static = static_prompt(input, FORMAT_MENU if schema.choices else FORMAT)
-        messages = self.services.context.prompt(static, self._dynamic(input, recall))
-        thoughts: list[LLMCall] = []
-        allowed = 1 if schema.choices else self.max_iterations
-        purpose = "think" if schema.choices else "act"
-        while len(thoughts) < allowed:
-            call = await self.services.llm.generate(purpose, messages, stop=STOP, **self.limit)
-            answer = None if schema.choices else last_action_line(call.text)
-            if answer is not None:
-                return self._decision(parse_action(answer, schema), thoughts, call, call.text)
-            thoughts.append(call)
-            last = len(thoughts) == allowed
-            reply = f"{ACKNOWLEDGED} {default_answer(schema)}" if last else ACKNOWLEDGED
-            messages = self.services.context.think((sampled(call),), reply)
-        action, call = await ask_action(self.services, messages, schema)
-        return self._decision(action, thoughts, call, "\n".join(t.text for t in thoughts))
+        menu = bool(input.action_schema.choices)
+        snapshot = self.services.context.layout == "snapshot"
+        transcript = "\n".join(self._transcript[-self.history :]) if snapshot else ""
+        dynamic = user_turn(input, recall, self.services, transcript=transcript)
+        messages = self.services.context.prompt(static_prompt(input, FORMAT_MENU if menu else FORMAT), dynamic)
+        return await self._loop(input, messages)
 
-    def _dynamic(self, input: AgentInput, recall: Recall) -> str:
-        text = user_turn(input, recall, self.services)
-        if self.services.context.layout == "snapshot" and self._transcript:
-            return "Transcript so far:\n" + "\n".join(self._transcript[-self.history :]) + f"\n\n{text}"
-        return text
+    async def _loop(self, input: AgentInput, messages: Sequence[Message]) -> Decision:
+        """Thoughts until an action comes, or until it is asked for alone."""
+        schema = input.action_schema
+        calls: list[tuple[int, int]] = []
+        words: list[str] = []
+        retries = self.max_retries
+        thoughts, allowed = 0, 1 if schema.choices else self.max_iterations
+        while thoughts < allowed:
+            call = await self.services.llm.generate(
+                "think" if schema.choices else "act", messages, stop=STOP, **self.limit
+            )
+            calls.append((call.id, 0))
+            words.append(call.text)
+            reading = read_call(call, schema)
+            if isinstance(reading.action, Action) and not schema.choices:
+                return self._decision(Acted(reading, call, tuple(calls)), words)
+            reply = ACKNOWLEDGED
+            meant = isinstance(reading.action, ActionError) and (
+                reading.explicit or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+            )
+            if meant and retries and not schema.choices:
+                assert isinstance(reading.action, ActionError)
+                self.services.count("truncated" if reading.action.code == "TRUNCATED" else "malformed")
+                retries -= 1
+                reply = complaint(reading.action, schema)
+            else:
+                thoughts += 1
+                if thoughts == allowed:
+                    reply = f"{ACKNOWLEDGED} {default_answer(schema)}"
+            messages = self.services.context.think((sampled(call),), reply)
+        acted = await ask_action(self.services, messages, schema, max_retries=retries)
+        return self._decision(Acted(acted.reading, acted.call, (*calls, *acted.calls)), words)
 
     @staticmethod
-    def _decision(action: Action | ActionError, thoughts: list[LLMCall], call: LLMCall, rationale: str) -> Decision:
+    def _decision(acted: Acted, words: list[str]) -> Decision:
         return Decision(
-            action,
-            rationale=rationale,
-            calls=(*((t.id, 0) for t in thoughts), (call.id, 0)),
-            valid=isinstance(action, Action),
-            turn=(sampled(call),),
+            acted.action,
+            rationale="\n".join(words),
+            calls=acted.calls,
+            valid=acted.valid,
+            turn=(sampled(acted.call),),
         )
 
     async def observe(self, transition: Transition) -> None:
-        thought = _thought(transition.decision.rationale)
+        rationale = transition.decision.rationale
+        reading = read(rationale, transition.input.action_schema)
+        thought = reading.thought if isinstance(reading.action, Action) else visible(rationale)[0]
+        thought = " ".join(thought.split()).removeprefix("Thought:").strip()
         result = transition.info.get("error") or transition.info.get("message") or "done"
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
 
@@ -109,9 +145,3 @@ class ReAct:
 
     def restore(self, blob: bytes) -> None:
         self._transcript = load_state(blob)
-
-
-def _thought(rationale: str) -> str:
-    """The thought alone, on one line: without its label and without the action that follows it."""
-    thought = re.split(r"\baction\s*:", rationale, maxsplit=1, flags=re.IGNORECASE)[0]
-    return " ".join(re.sub(r"^\s*thought\s*:", "", thought, flags=re.IGNORECASE).split())

@@ -11,22 +11,16 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from agentspec.actions import canonical
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, assistant, user
+from agentspec.parameters import at_least, settings
+from agentspec.prompting import MAX_RETRIES, MENU_ANSWER, require_variety, sampled, static_prompt, user_turn
 from agentspec.protocols import Services
-from agentspec.reasoning.common import (
-    MENU_ANSWER,
-    Stateless,
-    at_least,
-    canonical,
-    read_action,
-    sampled,
-    settings,
-    static_prompt,
-    user_turn,
-)
+from agentspec.reading import read
+from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.cot import THINK, THINK_THEN_CALL
-from agentspec.reasoning.search.meter import Ask, Meter
+from agentspec.reasoning.search.meter import Ask, Meter, last_resort
 from agentspec.registry import SpecError
 from agentspec.types import Action, ActionSchema, AgentInput, Decision, Recall
 
@@ -43,8 +37,8 @@ class Vote:
 
 
 def vote(text: str, rationale: str, schema: ActionSchema, calls: tuple[tuple[int, int], ...]) -> Vote | None:
-    """The vote of an answer; ``None`` if it holds no legal action."""
-    action = read_action(text, schema)
+    """The vote of an answer; `None` if it holds no legal action."""
+    action = read(text, schema).action
     return Vote(action, rationale, calls) if isinstance(action, Action) else None
 
 
@@ -56,7 +50,7 @@ class Tally:
 
     @classmethod
     def of(cls, votes: Sequence[Vote], schema: ActionSchema) -> Tally:
-        """Count ``votes`` over canonical actions."""
+        """Count `votes` over canonical actions."""
         groups: dict[Hashable, list[Vote]] = {}
         for vote in votes:
             groups.setdefault(canonical(vote.action, schema), []).append(vote)
@@ -78,18 +72,19 @@ class SelfConsistency(Stateless):
     """A vote over independent chains.
 
     Args:
-        preset: ``paper`` (5 samples, as AgentSpec) or ``rl`` (3).
+        preset: `paper` (5 samples, as AgentSpec) or `rl` (3).
         samples: chains per decision.
         sampling_temperature: temperature of the chains; above 0, or they would not be independent.
-        credit: which completions are credited as executed: those of the answer ``returned``, or of the whole
-            ``majority``; the others are credited as explored.
-        thought_tokens: most tokens of a chain (``None``: the spec's ``max_tokens``).
+        credit: which completions are credited as executed: those of the answer `returned`, or of the whole
+            `majority`; the others are credited as explored.
+        max_retries: further calls if no chain holds an action.
+        thought_tokens: most tokens of a chain (`None`: the spec's `max_tokens`).
     """
 
     declaration = Declaration(
         "independent chains of thought, and a vote over their actions",
-        calls=CallProfile(step=(1, 6)),
-        rl=CallProfile(step=(1, 4)),
+        calls=CallProfile(step=(1, 8)),
+        rl=CallProfile(step=(1, 6)),
         purposes=Purpose.each("step", "think", "act"),
         needs=("n",),
     )
@@ -102,18 +97,17 @@ class SelfConsistency(Stateless):
         sampling_temperature: float = 0.7,
         credit: str = "returned",
         thought_tokens: int | None = None,
+        max_retries: int = MAX_RETRIES,
     ) -> None:
         chosen = settings("self_consistency", PRESETS, preset, {"samples": samples})
         at_least("self_consistency", 1, samples=chosen["samples"])
-        if sampling_temperature <= 0:
-            raise SpecError(
-                f"self_consistency: sampling_temperature must be above 0, got {sampling_temperature}; greedy samples "
-                "are all the same and cannot vote"
-            )
+        at_least("self_consistency", 0, max_retries=max_retries)
+        require_variety("self_consistency", services, sampling_temperature)
         if credit not in ("returned", "majority"):
             raise SpecError(f"self_consistency: credit must be 'returned' or 'majority', got {credit!r}")
         self.services = services
         self.samples: int = chosen["samples"]
+        self.max_retries = max_retries
         self.credit = credit
         self.sampling: dict[str, Any] = {"temperature": sampling_temperature}
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
@@ -126,6 +120,7 @@ class SelfConsistency(Stateless):
         )
         meter = Meter(self.services.llm)
         answers = await (self._choose if schema.choices else self._answer)(meter, messages, schema)
+        require_variety("self_consistency", self.services, self.sampling["temperature"])
         votes = [a for a in answers if a is not None]
         tally = Tally.of(votes, schema)
         trace = {
@@ -135,7 +130,7 @@ class SelfConsistency(Stateless):
         }
         winner = tally.winner
         if winner is None:
-            return meter.undecided(trace)
+            return await last_resort(meter, messages, schema, trace, self.max_retries)
         credited = tally.groups[0] if self.credit == "majority" else (winner,)
         return Decision(
             winner.action,
@@ -147,7 +142,7 @@ class SelfConsistency(Stateless):
         )
 
     async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
-        """Chain and action in one completion; ``None`` for an answer without a legal action."""
+        """Chain and action in one completion; `None` for an answer without a legal action."""
         asked = await meter.ask_all(
             [Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
         )

@@ -2,17 +2,22 @@
 
 It acts like Reflexion: a retrospective model reads a failed trial, its return and the earlier lessons, and writes a
 lesson that stands in the actor's prompts. What makes it Retroformer is the training: the actor is frozen, and a lesson
-is paid the change of return it brought, ``G(next trial) - G(this trial)``.
+is paid the change of return it brought, `G(next trial) - G(this trial)`.
 
 *As it comes the reflector is untrained*: it is the policy's own weights, and the module measures what training needs.
-The call that writes a lesson is tagged ``reflection.retroformer/reflect`` and credited as executed; its reward is known
-one trial later and is recorded in *that* trial's metrics (``reflection/reward`` and whose call it pays).
-:func:`reflection_samples` joins the two. Samples of one ``group`` reflect on the same failed trial and are each
+The call that writes a lesson is tagged `reflection.retroformer/reflect` and credited as executed; its reward is known
+one trial later and is recorded in *that* trial's metrics (`reflection/reward` and whose call it pays).
+`reflection_samples` joins the two. Samples of one `group` reflect on the same failed trial and are each
 followed by a trial of their own, so their rewards compare like with like.
 
-``when`` says in which of the two trials the lesson is written: at the ``end`` of the failed one, or at the ``start`` of
-the next. What the reflector reads is the same. With ``start`` a lesson and the trial that pays it are one episode, so
+`when` says in which of the two trials the lesson is written: at the `end` of the failed one, or at the `start` of
+the next. What the reflector reads is the same. With `start` a lesson and the trial that pays it are one episode, so
 that many lessons can be drawn from the memory that one failed trial left: a trainer may learn from these.
+
+The reflector reads the actions on offer, the fullest view of the trial (the pool of orders, say), and the thought
+behind each step. `control` puts a fixed text in the place of every lesson: a meaningless one is what a trained
+reflector is to be compared with, since any text in the prompt changes what an actor does. Cost: one call per failed
+episode.
 """
 
 from __future__ import annotations
@@ -26,10 +31,11 @@ from typing import Any
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
+from agentspec.parameters import one_of
 from agentspec.protocols import Services
-from agentspec.reasoning.common import one_of
-from agentspec.reflection.reflexion import REFLECT, Reflexion
-from agentspec.reflection.trials import TrialLog, episode_return, trial_prompt
+from agentspec.reading import visible
+from agentspec.reflection.reflexion import Reflexion
+from agentspec.reflection.trials import TrialLog, episode_return
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, LLMCall, Recall, Task
@@ -78,15 +84,16 @@ class Retroformer(Reflexion):
 
     Args:
         max_prompt_updates: lessons shown to the actor, the newest ones.
-        threshold, max_repeats, key, reflection_tokens, trial_tokens: as in
-            :class:`~agentspec.reflection.reflexion.Reflexion`.
-        when: whether a lesson is written at the ``end`` of the failed trial or at the ``start`` of the next one.
-        temperature: sampling temperature of lessons (``None``: the agent's).
+        threshold, max_repeats, key, reflection_tokens, trial_tokens, control: as in
+            `agentspec.reflection.reflexion.Reflexion`.
+        when: whether a lesson is written at the `end` of the failed trial or at the `start` of the next one.
+        temperature: sampling temperature of lessons (`None`: the agent's).
     """
 
     declaration = Declaration(
         "Reflexion with a reflector of its own to be trained on the change of return (untrained as it comes)",
         calls=CallProfile(episode=(0, 1)),
+        scope="run",
         purposes={"reflect": Purpose("episode")},
         small=({"when": "start"},),
         small_calls=CallProfile(retrieve=(0, 1)),
@@ -101,12 +108,15 @@ class Retroformer(Reflexion):
         threshold: float | None = None,
         max_repeats: int = 0,
         key: str = "task",
-        reflection_tokens: int = 128,
+        reflection_tokens: int = 256,
         trial_tokens: int = 1024,
+        control: str = "",
         when: str = "end",
         temperature: float | None = None,
     ) -> None:
-        super().__init__(services, max_prompt_updates, threshold, max_repeats, key, reflection_tokens, trial_tokens)
+        super().__init__(
+            services, max_prompt_updates, threshold, max_repeats, key, reflection_tokens, trial_tokens, control
+        )
         one_of(self.name, when=(when, WHEN))
         self.when = when
         self.temperature = temperature
@@ -143,9 +153,7 @@ class Retroformer(Reflexion):
         await self.reflect(trajectory)
 
     async def _ask(self, trajectory: Trajectory, log: TrialLog) -> LLMCall | None:
-        count = self.services.llm.count_tokens
-        messages = trial_prompt(trajectory, log, self.max_reflections, REFLECT, self.trial_tokens, count)
-        due = Due(log.trials, episode_return(trajectory), *(m.text for m in messages))
+        due = Due(log.trials, episode_return(trajectory), *(m.text for m in self._prompt(trajectory, log)))
         if self.when == "start":
             self._due[self._key] = due
             return None
@@ -158,13 +166,13 @@ class Retroformer(Reflexion):
         call = await self.services.llm.generate("reflect", messages, max_tokens=self.reflection_tokens, **sampling)
         self.services.llm.executed(call)
         self._pending[self._key] = Pending(call.tag.episode, due.trial, call.id, due.before)
-        lesson = " ".join(call.text.split())
+        lesson = visible(call.text)[0]
         if lesson:
-            log.lessons = [*log.lessons, (due.trial, lesson)][-self.max_reflections :]
+            self._learn(log, due.trial, lesson)
         return call
 
     def metrics(self) -> dict[str, Any]:
-        """What the lesson of the trial before was worth (if there was one), and whether this trial's is ``due``."""
+        """What the lesson of the trial before was worth (if there was one), and whether this trial's is `due`."""
         return self._measured | ({"due": True} if self._key in self._due else {})
 
     def snapshot(self) -> bytes:

@@ -1,13 +1,15 @@
 """Self-Refine (Madaan et al., 2023): feedback on an answer, another answer, and again, until the critic is content.
 
-One model plays two roles in separate calls. The critic sees the situation and the candidate action before it is
-executed and says what is wrong with it; the refiner answers anew. Both are shown the whole history of attempts and
-feedback. It ends when the critic keeps the action, when a refinement changes nothing, or after ``max_iterations``. A
-refinement that is no legal action is ignored: the action stands, and the history says so. An illegal first action is
-shown to the critic with its error, so the method repairs what a reasoner could not parse.
+One model plays two roles in separate calls. The critic sees what the actor saw (memory and the conversation included),
+the candidate action and its rationale, and says, before it is executed, what is wrong with it; the refiner answers
+anew. Both are shown the history of attempts and feedback; of a long one the oldest feedback is cut, never an attempt.
+It ends when the critic keeps the action, when a refinement changes nothing, or after `max_iterations`. The verdict is
+asked for first, so that it cannot be cut off; a critic who gives none has not asked for a change. A refinement that is
+no legal action is ignored: the action stands, and the history says so. An illegal first action is shown to the critic
+with its error, so the method repairs what a reasoner could not parse.
 
-When an action is replaced its calls are credited as explored and the refining call as executed; a plan that goes on to
-guide later steps keeps its credit.
+When an action is replaced, its rationale is too; its calls are credited as explored and the refining call as executed;
+a plan that goes on to guide later steps keeps its credit. Cost per step: 1 call (kept at once) to 2 per iteration.
 """
 
 from __future__ import annotations
@@ -16,33 +18,26 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from agentspec.actions import same_action
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
-from agentspec.protocols import Services
-from agentspec.reasoning.common import (
-    CALL_ANSWER,
-    MENU_ANSWER,
-    ON_REQUEST,
-    at_least,
-    canonical,
-    clip,
-    read_action,
-    settings,
-    static_prompt,
-    user_turn,
-)
+from agentspec.parameters import at_least, settings
+from agentspec.prompting import CALL_ANSWER, MENU_ANSWER, ON_REQUEST, clip, read_call, static_prompt, user_turn
+from agentspec.reading import visible
+from agentspec.services import Services
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task
 
-PRESETS = {"paper": {"max_iterations": 3, "feedback_tokens": 96}, "rl": {"max_iterations": 1, "feedback_tokens": 48}}
+PRESETS = {"paper": {"max_iterations": 3, "feedback_tokens": 384}, "rl": {"max_iterations": 1, "feedback_tokens": 128}}
 
 ATTEMPT = "Attempt {number}: {action}"
+REASONS = "Its reasons: {reasons}"
 FEEDBACK_ON = "Feedback on attempt {number}: {feedback}"
 ASK_FEEDBACK = (
     "The latest attempt has not been carried out yet. Judge it as a strict critic: is it possible now, does it serve "
-    "the task, is there something clearly better? Name concrete changes in one to three sentences. Then write a last "
-    "line 'Verdict: keep' if it should be carried out as it is, otherwise 'Verdict: change'."
+    "the task, is there something clearly better? Begin with a line 'Verdict: keep' if it should be carried out as it "
+    "is, otherwise 'Verdict: change'. Then name concrete changes in one to three sentences."
 )
 ASK_REFINED = "Take all of the feedback into account and give a better attempt. {how}"
 
@@ -66,15 +61,22 @@ class Draft:
         self.attempts += 1
         self.history.append(ATTEMPT.format(number=self.attempts, action=text))
 
+    def comment(self, text: str) -> None:
+        """Add what is said about the latest attempt: its reasons, or feedback."""
+        if text:
+            self.history.append(text)
+
 
 class SelfRefine:
     """Feedback and refinement of every decision.
 
     Args:
-        preset: ``paper`` (at most 3 iterations, as AgentSpec) or ``rl`` (1, short feedback).
+        preset: `paper` (at most 3 iterations, as AgentSpec) or `rl` (1, short feedback).
         max_iterations: most pairs of feedback and refinement.
         feedback_tokens: most tokens of a feedback.
-        history_tokens: budget of attempts and feedback in a prompt; the oldest go first.
+        history_tokens: budget of attempts and feedback in a prompt; the oldest feedback goes first.
+        reason_tokens: most tokens shown of the rationale under judgement.
+        conversation: show the conversation so far to critic and refiner.
     """
 
     declaration = Declaration(
@@ -90,7 +92,9 @@ class SelfRefine:
         preset: str = "paper",
         max_iterations: int | None = None,
         feedback_tokens: int | None = None,
-        history_tokens: int = 512,
+        history_tokens: int = 768,
+        reason_tokens: int = 256,
+        conversation: bool = True,
     ) -> None:
         given = {"max_iterations": max_iterations, "feedback_tokens": feedback_tokens}
         chosen: dict[str, int] = settings("self_refine", PRESETS, preset, given)
@@ -99,6 +103,8 @@ class SelfRefine:
         self.max_iterations = chosen["max_iterations"]
         self.feedback_tokens = chosen["feedback_tokens"]
         self.history_tokens = history_tokens
+        self.reason_tokens = reason_tokens
+        self.conversation = conversation
 
     def begin_episode(self, task: Task) -> None:
         return None
@@ -110,6 +116,8 @@ class SelfRefine:
         """The decision, refined; as far as the budget allows."""
         draft = Draft(input, user_turn(input, recall, self.services), decision)
         draft.attempt(_shown(decision.action))
+        reasons = clip(" ".join(visible(decision.rationale)[0].split()), self.reason_tokens, self.services)
+        draft.comment(REASONS.format(reasons=reasons) if reasons else "")
         try:
             await self._refine(draft)
         except BudgetExceededError:
@@ -126,15 +134,16 @@ class SelfRefine:
 
     async def _refine(self, draft: Draft) -> None:
         for _ in range(self.max_iterations):
-            feedback = await self.services.llm.generate(
-                "feedback", self._prompt(draft, ASK_FEEDBACK), max_tokens=self.feedback_tokens
-            )
-            text = feedback.text.strip()
-            verdicts = _VERDICT.findall(text)
-            if not text or (verdicts and verdicts[-1].casefold() == "keep"):
-                draft.stopped = "kept"
+            answer = await self.services.ask("feedback", self._prompt(draft, ASK_FEEDBACK), self.feedback_tokens)
+            if answer.problem == "budget":
+                draft.stopped = "budget"
                 return
-            draft.history.append(FEEDBACK_ON.format(number=draft.attempts, feedback=_VERDICT.sub("", text).strip()))
+            text = answer.value or ""
+            verdicts = _VERDICT.findall(text)
+            if not verdicts or verdicts[-1].casefold() == "keep":
+                draft.stopped = "kept" if verdicts else "no verdict"
+                return
+            draft.comment(FEEDBACK_ON.format(number=draft.attempts, feedback=_VERDICT.sub("", text).strip(" \n*.")))
             if await self._another_attempt(draft):
                 draft.stopped = "unchanged"
                 return
@@ -146,18 +155,20 @@ class SelfRefine:
         choices = {"choices": schema.choices} if schema.choices else {}
         call = await self.services.llm.generate("refine", self._prompt(draft, request), **choices)
         draft.tried.append(call)
-        action = read_action(call.text, schema)
+        reading = read_call(call, schema)
+        action = reading.action
         if isinstance(action, ActionError):
             draft.attempt(f"{_shown(action)}; the attempt before it stands")
             return False
         standing = draft.decision.action
-        if isinstance(standing, Action) and canonical(action, schema) == canonical(standing, schema):
+        if same_action(action, standing, schema):
             return True
         draft.attempt(action.text)
         trace = {k: v for k, v in draft.decision.trace.items() if k != "fallback"}
         draft.decision = replace(
             draft.decision,
             action=action,
+            rationale=reading.thought or draft.history[-2],
             calls=((call.id, 0),),
             valid=True,
             turn=(action.text,),
@@ -166,8 +177,23 @@ class SelfRefine:
         return False
 
     def _prompt(self, draft: Draft, request: str) -> tuple[Message, ...]:
-        history = clip("\n".join(draft.history), self.history_tokens, self.services, keep="tail")
-        return (system(static_prompt(draft.input, ON_REQUEST)), user(f"{draft.situation}\n\n{history}\n\n{request}"))
+        history = "\n".join(self._within(draft.history))
+        turns = self.services.context.messages[1:] if self.conversation else ()
+        return (
+            system(static_prompt(draft.input, ON_REQUEST)),
+            *turns,
+            user(f"{draft.situation}\n\n{history}\n\n{request}"),
+        )
+
+    def _within(self, history: list[str]) -> list[str]:
+        """The history within its budget: attempts and the latest comment stay, older comments go first."""
+        kept = list(history)
+        comments = [i for i, line in enumerate(history[:-1]) if not line.startswith("Attempt ")]
+        for i in comments:
+            if self.services.llm.count_tokens("\n".join(kept)) <= self.history_tokens:
+                break
+            kept[i] = ""
+        return [line for line in kept if line]
 
     def _credit(self, before: Decision, draft: Draft) -> None:
         """Credit moves to the call whose action is executed; the agent credits that one itself."""

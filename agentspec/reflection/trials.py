@@ -1,7 +1,7 @@
 """Trials of a task: what counts as failure, which lessons belong to it, and how a trial reads.
 
-Shared by the methods that learn in words from one episode to the next. Lessons are kept per task (``key="task"``: the
-same world, options and seed, tried again) or per task family (``key="family"``: the same world and options, whatever
+Shared by the methods that learn in words from one episode to the next. Lessons are kept per task (`key="task"`: the
+same world, options and seed, tried again) or per task family (`key="family"`: the same world and options, whatever
 the seed), which is what a stream of unseen tasks needs.
 """
 
@@ -9,24 +9,31 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.base import describe
+from agentspec.prompting import clip, static_prompt
+from agentspec.reading import read, visible
+from agentspec.services import Services
 from agentspec.trajectory import Trajectory
-from agentspec.types import Recall, RecallItem, Task
+from agentspec.types import Action, Recall, RecallItem, Task, Transition
 
 KEYS = ("task", "family")
 
 HEADER = "Lessons from earlier trials of this task:"
 TRIAL = "Trial {number}: {lesson}"
 SITUATION = "At the beginning:\n{text}"
+FULLEST = "Before step {number}:\n{text}"
+OFFERED = "Actions on offer at first: {choices}"
+MAX_THOUGHT = 200
+"""Signs of a thought that a reflector is shown."""
 
 
 def key_of(task: Task, by: str) -> str:
-    """The name under which lessons of ``task`` are kept."""
+    """The name under which lessons of `task` are kept."""
     if by == "task":
         return task.key
     text = json.dumps([task.env, task.options], sort_keys=True, default=str)
@@ -47,11 +54,11 @@ class TrialLog:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> TrialLog:
-        """Read :meth:`to_data`."""
+        """Read `to_data`."""
         return cls(data["trials"], data["best"], [(number, text) for number, text in data["lessons"]])
 
     def recall(self, last: int, source: str) -> Recall:
-        """The ``last`` lessons, in the order they were learnt; the newest matter most."""
+        """The `last` lessons, in the order they were learnt; the newest matter most."""
         shown = [(TRIAL.format(number=number, lesson=text), number) for number, text in self.lessons[-last:]]
         return Recall(tuple(RecallItem(text, kind="lesson", source=source, priority=n) for text, n in shown))
 
@@ -64,9 +71,9 @@ def episode_return(trajectory: Trajectory) -> float:
 def failed(trajectory: Trajectory, best: float | None, threshold: float | None, max_repeats: int = 0) -> bool:
     """Whether a trial counts as failed.
 
-    In this order: the environment's own ``success`` metric; the same action ``max_repeats`` times in a row without a
-    reward (0: not looked at); a return below ``threshold``; without a threshold, a return below the ``best`` of the
-    task's earlier trials, or, in its first trial, no positive return.
+    In this order: the environment's own `success` metric; the same action `max_repeats` times in a row without a reward
+    (0: not looked at); a return below `threshold`. Without a threshold a graded task has no success, only better and
+    worse: a trial fails unless it beats the `best` of the task's earlier trials, and the first one has beaten nothing.
     """
     success = trajectory.metrics.get("success")
     if success is not None:
@@ -76,7 +83,7 @@ def failed(trajectory: Trajectory, best: float | None, threshold: float | None, 
     total = episode_return(trajectory)
     if threshold is not None:
         return total < threshold
-    return total <= 0 if best is None else total < best
+    return best is None or total <= best
 
 
 def _longest_repeat(trajectory: Trajectory) -> int:
@@ -90,28 +97,63 @@ def _longest_repeat(trajectory: Trajectory) -> int:
 
 
 def trial_prompt(
-    trajectory: Trajectory, log: TrialLog, last: int, request: str, budget: int, count_tokens: Callable[[str], int]
+    trajectory: Trajectory,
+    log: TrialLog,
+    last: int,
+    request: str,
+    budget: int,
+    services: Services,
+    view_tokens: int = 512,
 ) -> tuple[Message, ...]:
-    """The trial as a reflector reads it: the task, earlier lessons, how it began, its steps, its return, the request.
+    """The trial as a reflector reads it.
 
-    Of the steps the newest that fit into ``budget`` tokens are shown.
+    The task and its actions; earlier lessons; how it began, and the fullest view of the trial (the board of offers,
+    say) in `view_tokens` each; its steps with the thought behind each and what came of it, the newest that fit into
+    `budget` tokens; its return; the request.
     """
     first = trajectory.transitions[0].input
+    count = services.llm.count_tokens
     lines: list[str] = []
     used = 0
     for transition in reversed(trajectory.transitions):
-        line = describe(transition)
-        used += count_tokens(line) + 1
+        line = _told(transition)
+        used += count(line) + 1
         if used > budget:
             break
         lines.append(line)
     steps = "\n".join(reversed(lines))
     earlier = "\n".join(TRIAL.format(number=n, lesson=text) for n, text in log.lessons[-last:])
+    fullest = max(trajectory.transitions, key=lambda t: len(t.input.text))
     parts = [
         *([f"{HEADER}\n{earlier}"] if earlier else []),
-        SITUATION.format(text=first.text),
+        SITUATION.format(text=clip(first.text, view_tokens, services)),
+        *(
+            [FULLEST.format(number=fullest.step + 1, text=clip(fullest.input.text, view_tokens, services))]
+            if fullest.input.text != first.text
+            else []
+        ),
         f"The steps of trial {log.trials}:\n{steps}",
-        f"Its return was {episode_return(trajectory):g}" + (f" (best so far {log.best:g})." if log.best else "."),
+        f"Its return was {episode_return(trajectory):g}"
+        + (f" (best so far {log.best:g})." if log.best is not None else "."),
         request,
     ]
-    return (system(first.instruction), user("\n\n".join(parts)))
+    return (
+        system(
+            static_prompt(
+                first,
+                OFFERED.format(choices="; ".join(first.action_schema.choices)) if first.action_schema.choices else "",
+            )
+        ),
+        user("\n\n".join(parts)),
+    )
+
+
+def _told(transition: Transition) -> str:
+    """A step on one line, with the thought behind it."""
+    reading = read(transition.decision.rationale, transition.input.action_schema)
+    thought = reading.thought if isinstance(reading.action, Action) else visible(transition.decision.rationale)[0]
+    thought = " ".join(thought.split()).removeprefix("Thought:").strip()
+    if len(thought) > MAX_THOUGHT:
+        thought = thought[:MAX_THOUGHT] + "..."
+    line = describe(transition)
+    return f"{line} (thought: {thought})" if thought else line

@@ -68,7 +68,8 @@ class Case:
     def spec(self, layout: str = "conversation", **more: Any) -> AgentSpec:
         """An agent around the module; nothing else of it calls the model more than once."""
         module = {"name": self.name, **self.params}
-        return AgentSpec.from_data({"reasoning": "direct", self.kind: module, "layout": layout, **more})
+        scope = self.entry.declaration.scope or "episode"
+        return AgentSpec.from_data({"reasoning": "direct", self.kind: module, "layout": layout, "scope": scope, **more})
 
     def __str__(self) -> str:
         return f"{self.kind}-{self.name}" + (f"-{self.label}" if self.label else "")

@@ -178,3 +178,16 @@ def test_smollm2_extends_and_agrees_with_its_template():
     sampled = (*tokenizer.encode(" pick it  up"), tokenizer.eos_token_id)
     later = render([*messages, assistant(Sampled("pick it  up", sampled)), user("ok")], tokenizer)
     assert later[: len(prompt) + len(sampled)] == [*prompt, *sampled]
+
+
+def test_template_variables_of_a_tokenizer_reach_everything_that_renders_with_it() -> None:
+    from agentspec.llm.chat import chat_format, render, set_template_kwargs
+    from tests.tiny import tiny_tokenizer
+
+    tokenizer = tiny_tokenizer()
+    plain = tokenizer.decode(render([user("hi")], tokenizer))
+    set_template_kwargs(tokenizer, {"enable_thinking": False})
+    silent = tokenizer.decode(render([user("hi")], tokenizer))
+    # Qwen3's template writes an empty reasoning block where thinking is off.
+    assert "</think>" in silent and "</think>" not in plain
+    assert chat_format(tokenizer).render([user("hi")]) == ChatFormat(tokenizer).render([user("hi")])

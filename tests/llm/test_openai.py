@@ -295,3 +295,68 @@ def test_what_the_protocol_cannot_do_is_said(server):
     with pytest.raises(ValueError, match="unknown server"):
         llm(server, server="vlm")
     assert backend.count_tokens("12345") == 2
+
+
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ("temperature", "Unsupported value: 'temperature' does not support 0.5 with this model."),
+        ("top_p", "Unsupported parameter: 'top_p' is not supported with this model."),
+        ("stop", "Unsupported parameter: 'stop' is not supported with this model."),
+        ("seed", "Extra inputs are not permitted: seed"),
+    ],
+)
+def test_a_parameter_that_is_rejected_is_left_out_from_then_on_with_one_note(server, caplog, parameter, message):
+    server.script = [error(400, message), answer("one"), answer("two STOP three")]
+    backend = llm(server)
+    wanted = {"temperature": 0.5, "top_p": 0.9, "stop": ("STOP",)}
+    first, _ = ask(backend, user("x"), **wanted), ask(backend, user("x"), **wanted)
+    assert first.text == "one"
+    assert [parameter in body for body in server.bodies] == [True, False, False]
+    assert message in backend.rejected[parameter] and len(caplog.records) == 1
+    for other in {"temperature", "top_p", "seed"} - {parameter}:
+        assert other in server.bodies[-1]
+
+
+def test_stop_strings_that_are_rejected_are_cut_here(server):
+    server.script = [error(400, "Unsupported parameter: 'stop' is not supported"), answer("yes STOP no")]
+    assert ask(llm(server), user("x"), stop=("STOP",)).text == "yes "
+
+
+def test_several_samples_of_an_endpoint_that_gives_one(server):
+    server.script = [error(400, "Invalid value: 'n' must be 1 for this model"), answer("a"), answer("b"), answer("c")]
+    call = ask(llm(server), user("x"), n=3)
+    assert [c.text for c in call.completions] == ["a", "b", "c"] and "n" not in server.bodies[-1]
+
+
+def test_max_tokens_takes_its_new_name_where_asked_for(server):
+    said = "Unsupported parameter: 'max_tokens' is not supported with this model. Use 'max_completion_tokens' instead."
+    server.script = [error(400, said), answer("a")]
+    backend = llm(server)
+    ask(backend, user("x"), max_tokens=7), ask(backend, user("x"), max_tokens=7)
+    assert [(b.get("max_tokens"), b.get("max_completion_tokens")) for b in server.bodies] == [
+        (7, None),
+        (None, 7),
+        (None, 7),
+    ]
+    assert not backend.rejected
+
+
+def test_other_refusals_are_still_refusals(server):
+    server.script = [error(400, "the messages are malformed")]
+    with pytest.raises(LLMError, match="malformed"):
+        ask(llm(server), user("x"))
+    assert len(server.bodies) == 1
+
+
+def test_template_variables_reach_the_server(server):
+    ask(llm(server, template_kwargs={"enable_thinking": False}), user("x"))
+    assert server.bodies[0]["chat_template_kwargs"] == {"enable_thinking": False}
+
+
+def test_reasoning_has_room_of_its_own():
+    from agentspec.types import Sampling
+
+    assert Sampling().max_tokens >= 1024
+    assert Sampling(max_tokens=100, reasoning_tokens=400).with_room() == Sampling(max_tokens=500)
+    assert Sampling(max_tokens=100, reasoning_tokens=400, choices=("a",)).with_room().max_tokens == 100

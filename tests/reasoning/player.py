@@ -37,7 +37,8 @@ def named(name: str, request: Request) -> str:
 def operations(text: str) -> list[str]:
     """Operations named in ``text``, calls or menu entries, in order."""
     names = {f"{name}()": name for name in OPERATIONS} | {entry: name for name, entry in MENU.items()}
-    return [names[m] for m in re.findall("|".join(re.escape(n) for n in names), text)]
+    folded = {written.casefold(): name for written, name in names.items()}
+    return [folded[m] for m in re.findall("|".join(re.escape(n) for n in folded), text.casefold())]
 
 
 def last(request: Request) -> str:

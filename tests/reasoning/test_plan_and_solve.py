@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import dataclasses
 import re
 
 import pytest
 
 from agentspec.llm.base import Request
+from agentspec.llm.recorder import Recorder
+from agentspec.llm.scripted import ScriptedLLM
+from agentspec.reasoning.plan_and_solve import says_done
+from agentspec.spec import AgentSpec
+from agentspec.types import Action, ActionSchema, AgentInput, Decision, Transition
 from tests.reasoning.player import OPERATIONS, last, named, operations, play, purposes, seen, solve, solved
+
+PERSISTENT = {"name": "plan_and_solve", "persistent": True}
 
 
 def planner(request: Request) -> str:
@@ -25,7 +34,7 @@ def planner(request: Request) -> str:
 @pytest.mark.parametrize("layout", ["conversation", "snapshot"])
 @pytest.mark.parametrize("menu", [False, True])
 def test_solves_what_direct_does_not(menu: bool, layout: str) -> None:
-    trajectory, requests = play(planner, {"reasoning": "plan_and_solve", "layout": layout}, menu=menu)
+    trajectory, requests = play(planner, {"reasoning": PERSISTENT, "layout": layout}, menu=menu)
     assert solved(trajectory)
     assert purposes(requests).count("plan") == 1
     plan = "1. SUB()\n2. DOUBLE()\n3. ADD()"
@@ -35,7 +44,7 @@ def test_solves_what_direct_does_not(menu: bool, layout: str) -> None:
 
 
 def test_conversation_stays_one_sequence() -> None:
-    trajectory, _ = play(planner, {"reasoning": "plan_and_solve"}, menu=True)
+    trajectory, _ = play(planner, {"reasoning": PERSISTENT}, menu=True)
     for before, after in zip(trajectory.calls, trajectory.calls[1:], strict=False):
         whole = before.prompt_ids + before.completions[0].token_ids
         assert after.prompt_ids[: len(whole)] == whole
@@ -48,7 +57,7 @@ def failing(request: Request) -> str:
 
 
 def test_failures_in_a_row_lead_to_exactly_one_new_plan_that_is_told_of_them() -> None:
-    spec = {"name": "plan_and_solve", "replan_failures": 2}
+    spec = {**PERSISTENT, "replan_failures": 2, "max_retries": 0}
     _, requests = play(failing, {"reasoning": spec}, steps=4)
     assert purposes(requests) == ["plan", "act", "act", "plan", "act", "act"]
     assert "The last plan failed" in last(requests[3]) and "JUMP(): there is no action JUMP" in last(requests[3])
@@ -59,7 +68,7 @@ def test_a_success_in_between_forgets_the_failures() -> None:
     answers = iter(["JUMP()", "ADD()", "JUMP()", "ADD()"])
     _, requests = play(
         lambda r: "1. try" if r.tag.purpose == "plan" else f"Action: {next(answers)}",
-        {"reasoning": "plan_and_solve"},
+        {"reasoning": {**PERSISTENT, "max_retries": 0}},
         steps=4,
         target=1000,
     )
@@ -70,19 +79,17 @@ def test_a_plan_that_is_carried_out_or_old_is_replaced() -> None:
     def done(request: Request) -> str:
         return "1. one\n2. two" if request.tag.purpose == "plan" else "Sub-goal done.\nAction: SUB()"
 
-    _, requests = play(done, {"reasoning": "plan_and_solve"}, steps=4)
+    _, requests = play(done, {"reasoning": PERSISTENT}, steps=4)
     assert purposes(requests) == ["plan", "act", "act", "plan", "act", "act"]
     assert "is carried out" in last(requests[3]) and "sub-goal 2 (two)" in last(requests[2])
 
-    spec = {"name": "plan_and_solve", "replan_every": 1}
+    spec = {**PERSISTENT, "replan_every": 1}
     _, requests = play(lambda r: "1. on" if r.tag.purpose == "plan" else "Action: SUB()", {"reasoning": spec}, steps=2)
     assert purposes(requests) == ["plan", "act", "plan", "act"]
 
 
 def test_an_empty_plan_does_not_stop_it() -> None:
-    trajectory, requests = play(
-        lambda r: "" if r.tag.purpose == "plan" else "Action: SUB()", {"reasoning": "plan_and_solve"}
-    )
+    trajectory, requests = play(lambda r: "" if r.tag.purpose == "plan" else "Action: SUB()", {"reasoning": PERSISTENT})
     assert purposes(requests) == ["plan", "act", "act", "act"]
     assert "the task as a whole" in last(requests[1]) and trajectory.metrics["invalid_actions"] == 0
 
@@ -93,20 +100,65 @@ def test_rl_preset_acts_at_once_in_menu_mode() -> None:
     assert purposes(requests) == ["plan", "act", "act", "act"] and requests[0].sampling.max_tokens == 96
 
 
-def test_the_papers_one_call_form() -> None:
-    spec = {"name": "plan_and_solve", "one_call": True}
-    trajectory, requests = play(lambda r: "Plan: 1. x\nAction: SUB()", {"reasoning": spec})
-    assert purposes(requests) == ["act"] * 3 and trajectory.metrics["invalid_actions"] == 0
+@pytest.mark.parametrize("layout", ["conversation", "snapshot"])
+def test_plan_and_solution_together_is_the_default(layout: str) -> None:
+    def both(request: Request) -> str:
+        text = "\n".join(m.text for m in request.messages if m.role == "user")
+        (first, *_) = solve(*seen(text)) or ["ADD"]
+        if request.sampling.choices:
+            return named(first, request)
+        return f"Plan:\n1. {first}()\n2. and on\n" + ("" if request.tag.purpose == "think" else f"Action: {first}()")
+
+    trajectory, requests = play(both, {"reasoning": "plan_and_solve", "layout": layout})
+    assert purposes(requests) == ["act"] * 3 and solved(trajectory)
+    assert "devise a plan" in requests[0].messages[0].text and requests[0].sampling.max_tokens >= 1024
+    assert "Plan:" in trajectory.transitions[0].decision.rationale
+    trajectory, requests = play(both, {"reasoning": "plan_and_solve", "layout": layout}, menu=True)
+    assert purposes(requests) == ["think", "act"] * 3 and solved(trajectory)
+    assert "2. and on" not in "".join(m.text for m in requests[2].messages)  # anew at every step
+
+
+@pytest.mark.parametrize(
+    ("words", "done"),
+    [
+        ("Sub-goal done.", True),
+        ("The order is in the bag. Sub-goal 1 is done.", True),
+        ("Sub-goal done? No, not yet.", False),
+        ("Is sub-goal 1 done? No.", False),
+        ("Sub-goal not done.", False),
+        ("The sub-goal is not yet done.", False),
+        ("I will write 'Sub-goal done' when I arrive.", False),
+        ("Once sub-goal done, go on.", False),
+        ("Sub-goal done yet? Hardly.", False),
+        ("<think>Sub-goal done</think>On my way.", False),
+    ],
+)
+def test_only_a_report_moves_the_plan_on(words: str, done: bool) -> None:
+    assert says_done(words) is done
+
+
+def test_news_calls_for_a_new_plan_and_nothing_to_see_for_none() -> None:
+    from agentspec.reasoning.plan_and_solve import something_to_see
+
+    assert something_to_see({"number": 3}) and something_to_see({"offers": [1], "orders": []})
+    assert not something_to_see({"offers": [], "orders": []})
+    agent = AgentSpec.from_data({"reasoning": PERSISTENT}).build(Recorder(ScriptedLLM(["x"]), episode="e", seed=0))
+    method, seen_ = agent.reasoning, AgentInput("", "", ActionSchema({}), {"offers": [], "orders": []})
+    assert method._reason_to_plan(seen_) is None  # step 0: the board has not been read
+    assert method._reason_to_plan(dataclasses.replace(seen_, state={"offers": [1], "orders": []})) == ""
+    method._plan, method._goals = "1. a", ["a"]
+    assert method._reason_to_plan(seen_) is None
+    step = Transition(0, seen_, Decision(Action("A", text="A()")), "A()", 0.0, "", info={"events": ["delivered"]})
+    asyncio.run(method.observe(step))
+    assert method._reason_to_plan(seen_) == "was made before this: delivered"
+    quiet = dataclasses.replace(step, info={"events": ["bagged"]})
+    method._news = ""
+    asyncio.run(method.observe(quiet))
+    assert method._reason_to_plan(seen_) is None
 
 
 def test_state_survives_a_snapshot() -> None:
-    from agentspec.llm.recorder import Recorder
-    from agentspec.llm.scripted import ScriptedLLM
-    from agentspec.spec import AgentSpec
-
-    agent = AgentSpec.from_data({"reasoning": "plan_and_solve"}).build(
-        Recorder(ScriptedLLM(["x"]), episode="e", seed=0)
-    )
+    agent = AgentSpec.from_data({"reasoning": PERSISTENT}).build(Recorder(ScriptedLLM(["x"]), episode="e", seed=0))
     blob = agent.reasoning.snapshot()
     agent.reasoning._goals.append("x")
     agent.reasoning.restore(blob)

@@ -109,7 +109,7 @@ def test_without_scores_it_is_refused_or_counts_samples() -> None:
 
 def test_a_budget_returns_the_best_so_far_flagged() -> None:
     # Requests and scorings: 1 proposal, then 1 + 3 scorings; the world model may not be asked any more.
-    spec = {"name": "rap", "preset": "rl", "max_calls": 5}
+    spec = {"name": "rap", "preset": "rl", "reward": "paper", "max_calls": 5}
     trajectory, requests = play(imaginer, {"reasoning": spec}, score=nearness)
     decision = trajectory.transitions[0].decision
     assert purposes(requests) == ["propose"] * len(trajectory.transitions)

@@ -129,7 +129,17 @@ def test_a_search_without_a_legal_action_is_flagged() -> None:
 
 @pytest.mark.parametrize(
     ("text", "number"),
-    [("I say 7", 7), ("3 out of 10", 10), ("12", None), ("", None), ("2.5", None), ("1" * 50, None), ("9.", 9)],
+    [
+        ("I say 7", 7),
+        ("3 out of 10", 3),
+        ("I give it 8/10.", 8),
+        ("<think>9</think> 4", 4),
+        ("12", None),
+        ("", None),
+        ("2.5", None),
+        ("1" * 50, None),
+        ("9.", 9),
+    ],
 )
 def test_ratings_are_read_from_the_end(text: str, number: int | None) -> None:
     assert last_number(text, range(1, 11)) == number

@@ -16,6 +16,7 @@ from agentspec.llm.scripted import ScriptedLLM
 from agentspec.protocols import Services, StepClock
 from agentspec.reflection.reflexion import Reflexion
 from agentspec.reflection.trials import failed, key_of
+from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, ActionSchema, AgentInput, Decision, Task, Transition
@@ -52,10 +53,10 @@ def test_the_second_trial_solves_what_the_first_does_not(method: str, menu: bool
     assert purposes(requests).count("reflect") == 1  # none after the success
 
 
-def test_without_a_run_there_is_nothing_to_learn_from() -> None:
-    spec = {**SPEC, "scope": "episode"}
-    second, _ = play(learner, spec, jobs=2)
-    assert not solved(second)
+@pytest.mark.parametrize("method", ["reflexion", "retroformer"])
+def test_lessons_that_nobody_would_read_are_refused(method: str) -> None:
+    with pytest.raises(SpecError, match="set `scope: run`"):
+        AgentSpec.from_data({**SPEC, "reflection": method, "scope": "episode"})
 
 
 INPUT = AgentInput("Earn.", "It begins.", ActionSchema(ACTIONS))
@@ -90,8 +91,8 @@ def test_only_the_last_lessons_are_shown_in_order() -> None:
     reflexion, _ = module([f"lesson {i}" for i in range(5)])
     run(reflexion, *(trial(0.0) for _ in range(5)))
     task = Task(NUMBERS, 0)
-    # The first trial pays nothing; those after it are not below the best (0): one lesson.
-    assert len(shown(reflexion, task)) == 1
+    # Nothing is ever earned, so no trial beats the best one (0): each has a lesson, three are shown.
+    assert len(shown(reflexion, task)) == 3
     reflexion, _ = module([f"lesson {i}" for i in range(5)], threshold=1.0)
     run(reflexion, *(trial(0.0) for _ in range(5)))
     lines = shown(reflexion, task)
@@ -122,10 +123,12 @@ def test_the_reflector_reads_trial_return_and_lessons() -> None:
 @pytest.mark.parametrize(
     ("rewards", "best", "threshold", "metrics", "fails"),
     [
-        ((1.0,), None, None, {}, False),  # first trial, something earned
+        ((1.0,), None, None, {}, True),  # a first dollar is no success of a graded task
         ((0.0,), None, None, {}, True),
         ((1.0,), 2.0, None, {}, True),  # below the best so far
-        ((2.0,), 2.0, None, {}, False),
+        ((2.0,), 2.0, None, {}, True),  # no better than the best so far
+        ((2.5,), 2.0, None, {}, False),
+        ((3.0,), None, 3.0, {}, False),
         ((2.0,), 1.0, 3.0, {}, True),  # below the threshold
         ((4.0,), 9.0, 3.0, {}, False),
         ((9.0,), None, None, {"success": False}, True),  # the environment knows best

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.llm.base import Message
-from agentspec.reasoning.common import with_request
+from agentspec.prompting import with_request
+from agentspec.reading import visible
 from agentspec.reasoning.search.meter import Ask, Meter
 
 RATINGS = tuple(range(1, 11))
@@ -21,23 +22,33 @@ _INTEGER = re.compile(r"(?<![\d.])\d+(?![\d.]*\d)")
 
 
 def last_word(text: str, values: Mapping[str, float]) -> float | None:
-    """The value of the known word that stands last in ``text``, whatever its case; ``None`` if none does."""
+    """The value of the known word that stands last in `text`, whatever its case; `None` if none does."""
     pattern = r"\b(" + "|".join(re.escape(w) for w in values) + r")\b"
-    found = re.findall(pattern, text.casefold())
+    found = re.findall(pattern, visible(text)[0].casefold())
     return values[found[-1]] if found else None
 
 
 def last_number(text: str, allowed: Sequence[int]) -> int | None:
-    """The last whole number of ``text`` that is among ``allowed``; ``None`` if there is none."""
-    found = [int(m) for m in _INTEGER.findall(text[:10_000]) if len(m) < 10]
+    """The last whole number of `text` that is among `allowed`; `None` if there is none."""
+    text = re.sub(r"(\d+)\s*(?:/|out of)\s*\d+", r"\1", visible(text)[0][-10_000:])  # "7/10" means 7
+    found = [int(m) for m in _INTEGER.findall(text) if len(m) < 10]
     fitting = [n for n in found if n in allowed]
     return fitting[-1] if fitting else None
+
+
+def last_amount(text: str, label: str) -> float | None:
+    """The last number after `label` (`Estimate: about $12.50`); `None` if there is none."""
+    shown = visible(text)[0]
+    found = re.findall(
+        rf"\b{label}\b\W{{0,4}}[^\d\n+-]{{0,20}}([-+]?\$?\s?\d{{1,9}}(?:[.,]\d+)?)", shown, re.IGNORECASE
+    )
+    return float(re.sub(r"[$\s]", "", found[-1]).replace(",", ".")) if found else None
 
 
 async def rate(
     meter: Meter, prompts: Sequence[Sequence[Message]], *, constrained: bool, **sampling: Any
 ) -> list[float | None]:
-    """Mean rating (0 to 1) of each prompt that ends with :data:`RATE`; ``None`` where no answer holds a number.
+    """Mean rating (0 to 1) of each prompt that ends with `RATE`; `None` where no answer holds a number.
 
     Fewer come back when the budget ends among them: the first ones.
     """

@@ -17,11 +17,11 @@ class Problem(Protocol):
     """What is searched."""
 
     async def visit(self, node: Node) -> None:
-        """Fill in ``state``, ``reward`` and ``terminal`` of a node, from its parent's state and its action."""
+        """Fill in `state`, `reward` and `terminal` of a node, from its parent's state and its action."""
         ...
 
     async def actions(self, node: Node) -> Sequence[Node]:
-        """Children of a visited node, their fast rewards as ``prior``."""
+        """Children of a visited node, their fast rewards as `prior`."""
         ...
 
 
@@ -34,7 +34,7 @@ async def search(
     weight: float,
     record: list[tuple[float, list[Node]]] | None = None,
 ) -> None:
-    """Grow the tree under ``root``, whose state is given.
+    """Grow the tree under `root`, whose state is given.
 
     Args:
         iterations: paths to sample.

@@ -1,10 +1,11 @@
 """The budget of one decision: calls and tokens, and what happens when they run out.
 
-A method with many calls per decision asks the model through a :class:`Meter`. Questions that do not depend on each
-other are asked together (:meth:`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
+A method with many calls per decision asks the model through a `Meter`. Questions that do not depend on each
+other are asked together (`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
 end a search early: the method's own limits, the episode's budget, and a prompt that outgrew the model's context. All
-three raise :class:`OutOfBudgetError`; the method catches it and answers with the best action it has, flagged by
-``trace["exhausted"]``. Only if it has none is there nothing to answer with: see :meth:`Meter.undecided`.
+three raise `OutOfBudgetError`; the method catches it and answers with the best action it has, flagged by
+`trace["exhausted"]`. If it has none because nothing could be read, one plain question for the action follows, with what
+was wrong, at most `max_retries` times (`last_resort`); only then there is nothing to answer with (`Meter.undecided`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from typing import Any
 
 from agentspec.llm.base import ContextOverflowError, LLMError, Message
 from agentspec.llm.recorder import BudgetExceededError, ModuleLLM
-from agentspec.types import ActionError, Credit, Decision, LLMCall
+from agentspec.prompting import complaint, default_answer, in_private, read_call, sampled, with_request
+from agentspec.reading import read
+from agentspec.types import Action, ActionError, ActionSchema, Credit, Decision, LLMCall
 
 
 class OutOfBudgetError(BudgetExceededError):
@@ -38,11 +41,11 @@ class Meter:
 
     Args:
         llm: the module's metered model.
-        calls: most requests and scorings (``None``: no limit).
-        tokens: once this many tokens went in and out, no further request is made (``None``: no limit).
+        calls: most requests and scorings (`None`: no limit).
+        tokens: once this many tokens went in and out, no further request is made (`None`: no limit).
 
     Attributes:
-        exhausted: what ran out: ``"calls"``, ``"tokens"``, ``"episode"`` (its budget), ``"context"``, or empty.
+        exhausted: what ran out: `"calls"`, `"tokens"`, `"episode"` (its budget), `"context"`, or empty.
         answered: the first answer that proposed an action, for messages about what could not be read.
     """
 
@@ -75,7 +78,7 @@ class Meter:
         """Independent requests, made together; answers in their order.
 
         Fewer answers than requests come back when the budget ends among them: the first ones. Use those, then call
-        :meth:`stop`.
+        `stop`.
         """
         asks = asks[: self._allowed(len(asks))]
         self.calls += len(asks)
@@ -121,7 +124,7 @@ class Meter:
             raise OutOfBudgetError(str(error)) from error
 
     def _allowed(self, wanted: int) -> int:
-        """How many of ``wanted`` requests the limits leave room for."""
+        """How many of `wanted` requests the limits leave room for."""
         if self.exhausted:
             return 0
         if self._limits["tokens"] is not None and self.tokens >= self._limits["tokens"]:
@@ -133,7 +136,7 @@ class Meter:
         return max(0, min(wanted, room))
 
     def stop(self) -> None:
-        """Raise :class:`OutOfBudgetError` if something ran out."""
+        """Raise `OutOfBudgetError` if something ran out."""
         if self.exhausted:
             limit = self._limits.get(self.exhausted)
             raise OutOfBudgetError(
@@ -166,6 +169,39 @@ class Meter:
             valid=False,
             trace={**trace, **self.trace(), "fallback": "nothing parsed"},
         )
+
+
+async def last_resort(
+    meter: Meter, messages: Sequence[Message], schema: ActionSchema, trace: Mapping[str, Any], max_retries: int
+) -> Decision:
+    """The decision of a method none of whose answers held a legal action: it is asked for plainly, told what was wrong.
+
+    Args:
+        meter: of the decision; its limits hold.
+        messages: the step's prompt, ending in the observation.
+        schema: the actions.
+        trace: the method's trace.
+        max_retries: calls that may be made.
+    """
+    error = read(meter.answered, schema).action
+    reply = complaint(error, schema) if isinstance(error, ActionError) else default_answer(schema)
+    prompt: Sequence[Message] = with_request(messages, reply)
+    sampling = {"choices": schema.choices} if schema.choices else {}
+    calls: list[tuple[int, int]] = []
+    while len(calls) < max_retries and not meter.exhausted:
+        asked = await meter.ask_all([Ask("act", prompt, sampling, "executed")])
+        if not asked:
+            break
+        (call,) = asked
+        calls.append((call.id, 0))
+        reading = read_call(call, schema)
+        if isinstance(reading.action, Action):
+            found = {**trace, **meter.trace(), "asked_again": len(calls)}
+            return Decision(
+                reading.action, rationale=call.text, calls=tuple(calls), turn=(reading.action.text,), trace=found
+            )
+        prompt = in_private(prompt, sampled(call), complaint(reading.action, schema))
+    return meter.undecided(trace)
 
 
 def _first_failure(answers: Sequence[object]) -> int:

@@ -7,9 +7,10 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from agentspec.actions import parse_action
+from agentspec.actions import canonical, parse_action
 from agentspec.llm.base import Message
-from agentspec.reasoning.common import canonical, last_action_line, read_action, with_request
+from agentspec.prompting import with_request
+from agentspec.reading import labelled, read, takes_lines, visible
 from agentspec.reasoning.search.meter import Meter
 from agentspec.types import Action, ActionSchema, LLMCall
 
@@ -29,30 +30,42 @@ class Proposal:
     thought: str = ""
 
 
-def read_step(text: str, schema: ActionSchema, *, imagined: bool) -> tuple[str, Hashable] | None:
-    """The action in a piece of free text and what identifies it, or ``None``.
+def read_step(
+    text: str, schema: ActionSchema, *, imagined: bool, cut: bool = False
+) -> tuple[str, Hashable, str] | None:
+    """The action in an answer, what identifies it, and the thought before it; `None` if there is none.
 
-    In an ``imagined`` state of a menu environment nobody knows the menu, so any short line counts as a step there; it
-    is never executed. A known action call is always read as such.
+    In an `imagined` state of a menu environment nobody knows the menu, so any short line counts as a step there; it is
+    never executed. A known action call is always read as such.
     """
-    action = read_action(text, schema)
-    if isinstance(action, Action):
-        return action.text, canonical(action, schema)
-    line = last_action_line(text) or next((part.strip() for part in text.splitlines() if part.strip()), "")
-    if imagined and schema.choices and line and len(line) <= MAX_LINE:
-        return line, " ".join(line.casefold().split())
+    reading = read(text, schema, cut=cut)
+    if isinstance(reading.action, Action):
+        return reading.action.text, canonical(reading.action, schema), reading.thought
+    if imagined and schema.choices:
+        shown = re.split(r"(?im)^\W*action\W*:", visible(text)[0])
+        line = next((part.strip(" \t*`\"'") for part in shown[-1].splitlines() if part.strip(" \t*`\"'")), "")
+        if line and len(line) <= MAX_LINE:
+            return line, " ".join(line.casefold().split()), shown[0].strip() if len(shown) > 1 else ""
     return None
 
 
 def read_steps(text: str, schema: ActionSchema, *, imagined: bool) -> list[str]:
-    """The steps listed in ``text``, one a line, numbers and bullets dropped, equal ones once."""
+    """The steps listed in `text`, one a line in whatever dress, equal ones once.
+
+    Lines with an `Action:` label count alone where there are any. An answer that is no list of lines may still be one
+    action (JSON, a label and its call on the next line).
+    """
+    whole = read_step(text, schema, imagined=imagined)
+    if whole is not None and takes_lines(text):
+        return [whole[0]]
     found: dict[Hashable, str] = {}
-    for line in text.splitlines():
+    lines = visible(text)[0].splitlines()
+    for line in [line for line in lines if labelled(line)] or lines:
         bare = _BULLET.sub("", line, count=1)
-        step = read_step(bare, schema, imagined=imagined) if bare.strip() else None
+        step = read_step(bare, schema, imagined=imagined) if bare.strip("` \t") else None
         if step is not None:
             found.setdefault(step[1], step[0])
-    return list(found.values())
+    return list(found.values()) or ([whole[0]] if whole is not None else [])
 
 
 async def sample_steps(
@@ -65,10 +78,10 @@ async def sample_steps(
     imagined: bool,
     **sampling: Any,
 ) -> list[Proposal]:
-    """``n`` samples of the next action in one request, equal ones merged, in the order they first came.
+    """`n` samples of the next action in one request, equal ones merged, in the order they first came.
 
-    Decoding is constrained to the menu where there is one and the state is not an ``imagined`` one. Every sample is
-    credited ``explored``; whoever executes one credits it anew.
+    Decoding is constrained to the menu where there is one and the state is not an `imagined` one. Every sample is
+    credited `explored`; whoever executes one credits it anew.
     """
     if schema.choices and not imagined:
         call = await meter.ask(
@@ -80,14 +93,14 @@ async def sample_steps(
 
 
 def merge(call: LLMCall, schema: ActionSchema, *, imagined: bool) -> list[Proposal]:
-    """The samples of ``call`` as proposals."""
+    """The samples of `call` as proposals."""
     found: dict[Hashable, Proposal] = {}
     for i, completion in enumerate(call.completions):
-        step = read_step(completion.text, schema, imagined=imagined)
+        step = read_step(completion.text, schema, imagined=imagined, cut=completion.finish_reason == "length")
         if step is None:
             continue
         known = found.get(step[1])
-        thought = completion.text if last_action_line(completion.text) else ""
+        thought = step[2]
         found[step[1]] = (
             Proposal(step[0], 1, (call.id, i), thought)
             if known is None
@@ -97,6 +110,6 @@ def merge(call: LLMCall, schema: ActionSchema, *, imagined: bool) -> list[Propos
 
 
 def legal(text: str, schema: ActionSchema) -> Action | None:
-    """``text`` as an action of ``schema``."""
+    """`text` as an action of `schema`."""
     action = parse_action(text, schema)
     return action if isinstance(action, Action) else None

@@ -1,7 +1,7 @@
 """One search tree for all methods: nodes, UCT, selection and back-propagation.
 
 A node stands for an action taken in its parent's state. Its state is filled in when it is visited (RAP) or expanded
-(LATS). ``returns`` holds, for every iteration that passed through, the sum of rewards from this node to the path's end.
+(LATS). `returns` holds, for every iteration that passed through, the sum of rewards from this node to the path's end.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ class Node:
 
     Args:
         action: text of the action that leads here; empty at the root.
-        parent: where from; ``None`` at the root.
-        state: whatever the method keeps of the state; ``None`` before it is visited.
+        parent: where from; `None` at the root.
+        state: whatever the method keeps of the state; `None` before it is visited.
         prior: heuristic value before any iteration passed through.
         reward: reward of the step that leads here.
-        children: ``None`` before expansion.
+        children: `None` before expansion.
         terminal: nothing follows this state.
         closed: nothing new can be learnt below (terminal, or all children closed).
         source: (call id, completion) that proposed the action.
@@ -82,9 +82,9 @@ class Node:
 
 
 def uct(value: float, parent_visits: int, visits: int, weight: float) -> float:
-    """Upper confidence bound for trees: ``value + weight * sqrt(ln N(parent) / N)``.
+    """Upper confidence bound for trees: `value + weight * sqrt(ln N(parent) / N)`.
 
-    ``value`` is a mean already and is not divided by the visits again. An unvisited node counts as visited once, its
+    `value` is a mean already and is not divided by the visits again. An unvisited node counts as visited once, its
     prior standing in for the mean (RAP, LATS).
     """
     return value + weight * math.sqrt(math.log(max(1, parent_visits)) / max(1, visits))
@@ -109,7 +109,7 @@ def select(root: Node, weight: float, depth: int, *, open_only: bool = False) ->
 
 
 def backpropagate(path: Sequence[Node], tail: float = 0.0) -> float:
-    """Append to every node on ``path`` the sum of rewards from it to the end plus ``tail``; returns the root's."""
+    """Append to every node on `path` the sum of rewards from it to the end plus `tail`; returns the root's."""
     total = tail
     for node in reversed(path):
         total += node.reward
@@ -118,7 +118,7 @@ def backpropagate(path: Sequence[Node], tail: float = 0.0) -> float:
 
 
 def close(node: Node) -> None:
-    """Close ``node``, and every ancestor whose children are now all closed."""
+    """Close `node`, and every ancestor whose children are now all closed."""
     node.closed = True
     while node.parent is not None and all(c.closed for c in node.parent.children or ()):
         node = node.parent
@@ -126,7 +126,7 @@ def close(node: Node) -> None:
 
 
 def nodes_where(root: Node, holds: Callable[[Node], bool]) -> list[Node]:
-    """The nodes for which ``holds`` is true, depth first, children in their order."""
+    """The nodes for which `holds` is true, depth first, children in their order."""
     found, stack = [], [root]
     while stack:
         node = stack.pop()
@@ -139,7 +139,7 @@ def nodes_where(root: Node, holds: Callable[[Node], bool]) -> list[Node]:
 def best_leaf(root: Node, depth: int) -> tuple[float, Node] | None:
     """The visited leaf, terminal or at the depth limit, with the greatest sum of rewards from the root (first on ties).
 
-    ``None`` if no iteration reached one.
+    `None` if no iteration reached one.
     """
     best: tuple[float, Node] | None = None
     stack: list[tuple[float, Node]] = [(0.0, root)]

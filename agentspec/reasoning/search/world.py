@@ -1,6 +1,6 @@
 """The two worlds a search can move in: the environment itself, and the model's idea of it.
 
-Both take a node's parent state and action to an :class:`Outcome`. The environment is exact and is put back by its
+Both take a node's parent state and action to an `Outcome`. The environment is exact and is put back by its
 user; the model predicts in words what would be observed, and whether the task would be accomplished, or over without
 that.
 """
@@ -13,19 +13,23 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from agentspec.llm.base import Message
+from agentspec.prompting import Step, course, with_request
 from agentspec.protocols import Services, Simulator
-from agentspec.reasoning.common import clip, with_request
+from agentspec.reading import visible
+from agentspec.reasoning.search.judge import last_amount
 from agentspec.reasoning.search.meter import Meter
 from agentspec.reasoning.search.tree import Node
 from agentspec.types import ActionSchema, AgentInput
 
 PREDICT = (
     "Nobody acts now; imagine. What would be observed after the last step above? Write the new situation in at most "
-    "three short sentences: only what changes, and the numbers that matter. Then write a last line: 'Goal: yes' if the "
-    "task would be accomplished by then, 'Goal: over' if it would have ended without that, otherwise 'Goal: no'."
+    "three short sentences: only what changes, and the numbers that matter. Then write two last lines: 'Earned: ' and "
+    "what this step itself would pay or cost as a number, and 'Goal: yes' if the task would be accomplished by then, "
+    "'Goal: over' if it would have ended without that, otherwise 'Goal: no'."
 )
 STEPS = "Steps tried in thought from here:\n{steps}"
 
+_EARNED = re.compile(r"^\W*earned\b.*$", re.IGNORECASE | re.MULTILINE)
 _GOAL = re.compile(r"\bgoal\W{0,4}(yes|no|over)\b", re.IGNORECASE)
 
 
@@ -39,7 +43,8 @@ class Outcome:
         schema: actions there; in an imagined state the last known ones.
         reward: reward of the step (model: 1 if the goal is reached, else 0).
         ended: nothing follows.
-        success: whether an ended state is a success; ``None`` if the world does not say.
+        success: whether an ended state is a success; `None` if the world does not say.
+        earned: what the step pays in the environment's unit, as far as the world says.
     """
 
     state: Any
@@ -48,15 +53,16 @@ class Outcome:
     reward: float = 0.0
     ended: bool = False
     success: bool | None = None
+    earned: float = 0.0
 
 
 class World(Protocol):
-    """Where a search tries its steps. ``real``: in the environment itself."""
+    """Where a search tries its steps. `real`: in the environment itself."""
 
     real: bool
 
     async def step(self, node: Node) -> Outcome:
-        """What ``node``'s action leads to; the parent's ``state`` is an outcome (or the root's)."""
+        """What `node`'s action leads to; the parent's `state` is an outcome (or the root's)."""
         ...
 
 
@@ -81,6 +87,7 @@ class RealWorld:
             seen.reward,
             seen.ended,
             None if success is None else bool(success),
+            seen.reward,
         )
 
 
@@ -115,11 +122,13 @@ class ModelWorld:
         assert node.parent is not None
         request = f"{render_steps(node, self._services, self._path_tokens)}\n\n{PREDICT}"
         call = await self._meter.ask("world", with_request(self._base, request), **self._sampling)
-        verdicts = _GOAL.findall(call.text)
+        said = visible(call.text)[0]
+        verdicts = _GOAL.findall(said)
         verdict = verdicts[-1].casefold() if verdicts else "no"
         reached, ended = verdict == "yes", verdict != "no"
-        text = _GOAL.sub("", call.text).strip() or "nothing that could be foreseen"
-        return Outcome(None, text, node.parent.state.schema, float(reached), ended, reached if ended else None)
+        text = _EARNED.sub("", _GOAL.sub("", said)).strip() or "nothing that could be foreseen"
+        schema, earned = node.parent.state.schema, last_amount(said, "earned") or 0.0
+        return Outcome(None, text, schema, float(reached), ended, reached if ended else None, earned)
 
 
 def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:
@@ -128,9 +137,9 @@ def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:
 
 
 def render_steps(node: Node, services: Services, budget: int) -> str:
-    """The steps from the root to ``node`` with what was observed after each, the newest within ``budget`` tokens."""
-    lines = []
-    for i, step in enumerate(node.path[1:], 1):
-        seen = f" -> {step.state.text}" if step.state is not None else ""
-        lines.append(f"{i}. {step.action}{seen}")
-    return STEPS.format(steps=clip("\n".join(lines), budget, services, keep="tail")) if lines else ""
+    """The steps from the root to `node`: actions with their thoughts, and what was observed, within `budget`."""
+    steps = [
+        Step(step.action, getattr(step.note, "thought", "") or "", step.state.text if step.state is not None else "")
+        for step in node.path[1:]
+    ]
+    return STEPS.format(steps=course(steps, budget, services)) if steps else ""

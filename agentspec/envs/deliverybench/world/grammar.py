@@ -153,6 +153,16 @@ ALIASES: Mapping[str, str] = {
 }
 
 
+DEFAULTS: Mapping[tuple[str, str], Any] = {
+    ("MOVE", "pace"): "normal",
+    ("BUY", "qty"): 1,
+    ("TURN_AROUND", "direction"): "left",
+}
+"""What leaving out an argument means."""
+
+_LENGTHS = frozenset({("MOVE", "x"), ("MOVE", "y")})
+
+
 def schema_for(rules: Rules) -> ActionSchema:
     """The action schema of a rule set. Lengths arrive in cm (``12m`` is 1200.0 and 12 is 12 cm) under the quirk
     ``bare_numbers_are_cm``, otherwise in metres (``12m`` and 12 are both 12)."""
@@ -161,7 +171,21 @@ def schema_for(rules: Rules) -> ActionSchema:
 
 @lru_cache(maxsize=2)
 def _schema(centimetres: bool = False) -> ActionSchema:
-    return ActionSchema({spec.name: spec for spec in _SPECS}, ALIASES, {"m": 100.0 if centimetres else 1.0})
+    metre = 100.0 if centimetres else 1.0
+    return ActionSchema({spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, {"m": metre})
+
+
+def _fitted(spec: ActionSpec, metre: float) -> ActionSpec:
+    """The action with what its omitted arguments mean, and the differences that matter to the world."""
+    parameters = {
+        name: replace(
+            parameter,
+            default=DEFAULTS.get((spec.name, name)),
+            resolution=metre if (spec.name, name) in _LENGTHS else 1.0 if parameter.type == "float" else 0.0,
+        )
+        for name, parameter in spec.parameters.items()
+    }
+    return replace(spec, parameters=parameters)
 
 
 SOCIAL = (

@@ -1,0 +1,92 @@
+"""The players that the environment names (see `agentspec.envs.experts`): the shortest plan, and chance.
+
+The expert sees the whole grid: it sets up the layout that `info["state"]` names, plays the actions so far, and searches
+from there. It is the upper reference for success and efficiency, and the demonstrator of warm starts; a player that has
+to find its way cannot always be as short.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import minigrid  # noqa: F401  (registers its environments)
+
+from agentspec.envs.minigrid.env import CALLS, NO_ACTION
+from agentspec.envs.minigrid.search import shortest_plan
+
+
+class ShortestPlan:
+    """Follows a shortest plan, and searches anew when something else was done."""
+
+    def __init__(self, most_states: int = 200_000) -> None:
+        self._most_states = most_states
+        self._done: list[int] = []
+        self._plan: list[int] = []
+
+    def act(self, info: Mapping[str, Any]) -> str:
+        """The next action of a shortest plan; "done" where nothing leads to success any more."""
+        state = info["state"]
+        history = [int(a) for a in state["history"]]
+        if history != self._done or not self._plan:
+            self._plan = self._search(state["layout"], history)
+        action = self._plan.pop(0) if self._plan else len(CALLS) - 1
+        self._done = [*history, action]
+        phrases = info["action_schema"].choices
+        return phrases[action] if phrases else f"{list(CALLS)[action]}()"
+
+    def _search(self, layout: Mapping[str, Any], history: list[int]) -> list[int]:
+        env = gymnasium.make(layout["id"], disable_env_checker=True)
+        try:
+            env.reset(seed=layout["seed"])
+            world: Any = env.unwrapped
+            world.max_steps = 10**9
+            for action in history:
+                if action != NO_ACTION:
+                    world.step(action)
+            return shortest_plan(world, most_states=self._most_states) or []
+        finally:
+            env.close()
+
+    def snapshot(self) -> bytes:
+        """What was done, and what is planned."""
+        return json.dumps([self._done, self._plan]).encode()
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`."""
+        self._done, self._plan = json.loads(blob)
+
+
+class Chance:
+    """Any of the seven actions."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self._rng = rng
+
+    def act(self, info: Mapping[str, Any]) -> str:
+        """A random action."""
+        phrases = info["action_schema"].choices
+        return self._rng.choice(phrases or [f"{name}()" for name in CALLS])
+
+    def snapshot(self) -> bytes:
+        """The generator's state."""
+        version, numbers, gauss = self._rng.getstate()
+        return json.dumps([version, list(numbers), gauss]).encode()
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`."""
+        version, numbers, gauss = json.loads(blob)
+        self._rng.setstate((version, tuple(numbers), gauss))
+
+
+def expert(options: Mapping[str, Any], rng: random.Random, most_states: int = 200_000) -> ShortestPlan:
+    """The player `rule_based`; `most_states` bounds each search."""
+    return ShortestPlan(most_states)
+
+
+def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
+    """The player `random`."""
+    return Chance(rng)

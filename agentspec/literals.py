@@ -1,0 +1,202 @@
+"""The language of actions: one call with literal arguments, `MOVE(12.5m, -3m, pace="accel")`.
+
+`scan_call` finds where a call ends, `parse_call` reads it, `render_call` writes one. Names are matched without case,
+through the schema's aliases, and whatever joins their words (`view orders`, `view-orders`). Numbers followed by a unit
+of the schema are multiplied by its factor. Arguments are read by Python's own expression parser restricted to literals;
+nothing is ever evaluated. What chat models get wrong about literals is understood: words without quotes, `name: value`,
+`true` and `null`.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import functools
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from agentspec.types import Action, ActionError, ActionSchema
+
+MAX_LENGTH = 4000
+"""Longer calls are refused: no action is this long, and deeply nested input must not reach the parser."""
+
+_QUOTED = re.compile(r"(\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^'\\])*')", re.DOTALL)
+_COLON = re.compile(r"(^|[(,]\s*)([A-Za-z_]\w*)\s*:\s*")
+_OPENING, _CLOSING = {"(": ")", "[": "]", "{": "}"}, frozenset(")]}")
+_WORDS = {"true": True, "false": False, "none": None, "null": None}
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call found in a text: its name and arguments as written, and the offset after its closing bracket."""
+
+    name: str
+    arguments: str
+    text: str
+    end: int
+
+
+def suggest(name: str, known: Iterable[Any]) -> str:
+    """`"; did you mean A, B?"` for the nearest known names, or the list of all when none is near."""
+    names = [str(k) for k in known]
+    lowered = {k.casefold(): k for k in names}
+    near = [lowered[k] for k in difflib.get_close_matches(name.casefold(), list(lowered), n=3, cutoff=0.6)]
+    if near:
+        return f"; did you mean {', '.join(near)}?"
+    return f"; known: {', '.join(sorted(names))}"
+
+
+def known_name(name: str, schema: ActionSchema) -> str | None:
+    """The canonical name that `name` stands for, up to case, joining signs and a prefix (`functions.MOVE`)."""
+    found = _names(schema).get(_squash(name))
+    return found or _names(schema).get(_squash(name.rpartition(".")[2]))
+
+
+def _names(schema: ActionSchema) -> dict[str, str]:
+    return _squashed(tuple(schema.actions), tuple(schema.aliases.items()))
+
+
+@functools.lru_cache(maxsize=32)
+def _squashed(names: tuple[str, ...], aliases: tuple[tuple[str, str], ...]) -> dict[str, str]:
+    return {_squash(alias): name for alias, name in aliases} | {_squash(name): name for name in names}
+
+
+def _squash(name: str) -> str:
+    return re.sub(r"[\s_\-]+", "", name).upper()
+
+
+def scan_arguments(text: str, start: int) -> int | None:
+    """Offset after the bracket that closes the one at `start`; `None` if it is never closed (or after 4000 signs)."""
+    stack: list[str] = []
+    quote = ""
+    i, limit = start, min(len(text), start + MAX_LENGTH)
+    while i < limit:
+        sign = text[i]
+        if quote:
+            if sign == "\\":
+                i += 1
+            elif sign == quote:
+                quote = ""
+        elif sign == '"' or (sign == "'" and not text[i - 1].isalnum()):
+            quote = sign
+        elif sign in _OPENING:
+            stack.append(_OPENING[sign])
+        elif sign in _CLOSING:
+            if stack.pop() != sign:
+                return None
+            if not stack:
+                return i + 1
+        i += 1
+    return None
+
+
+def scan_call(text: str, name: re.Match[str]) -> Call | None:
+    """The call whose name and opening bracket `name` matched (group 1: the name); `None` if it is not closed."""
+    end = scan_arguments(text, name.end() - 1)
+    if end is None:
+        return None
+    return Call(name.group(1), text[name.end() : end - 1], text[name.start(1) : end], end)
+
+
+def parse_call(call: Call, schema: ActionSchema) -> Action | ActionError:
+    """Read a call; only the form of its arguments is judged, their values are the environment's affair."""
+    name = known_name(call.name, schema)
+    if name is None:
+        problem = f"there is no action {call.name.upper()}{suggest(call.name, schema.actions)}"
+        return ActionError("PARSE_UNKNOWN", problem, call.text[:200])
+    try:
+        args, kwargs = _arguments(call.arguments, schema)
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
+        example = schema.actions[name].example or name
+        reason = error.msg if isinstance(error, SyntaxError) else error
+        return ActionError(
+            "PARSE_ARGS", f"the arguments of {name} cannot be read ({reason}); write {example}", call.text[:200]
+        )
+    return Action(name, args, kwargs, call.text)
+
+
+def render_call(name: str, args: Iterable[Any], kwargs: Mapping[str, Any], schema: ActionSchema) -> str:
+    """The call as text. Strings that hold a number (with or without a unit) are written without quotes."""
+    parts = [_shown(value, schema) for value in args]
+    parts += [f"{key}={_shown(value, schema)}" for key, value in kwargs.items()]
+    return f"{name}({', '.join(parts)})"
+
+
+def _shown(value: Any, schema: ActionSchema) -> str:
+    if isinstance(value, str):
+        units = "|".join(re.escape(u) for u in schema.units)
+        if re.fullmatch(rf"\s*[-+]?(\d+(\.\d*)?|\.\d+)\s*({units})?\s*", value):
+            return value.strip()
+        return json.dumps(value, ensure_ascii=False)
+    return repr(value)
+
+
+def _arguments(text: str, schema: ActionSchema) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    text = _apply_units(text.strip(), schema)
+    try:
+        tree = ast.parse(f"f({text})", mode="eval").body
+    except SyntaxError:
+        named = _outside_quotes(text, lambda part: _COLON.sub(r"\1\2=", part))
+        tree = ast.parse(f"f({named})", mode="eval").body
+    if not isinstance(tree, ast.Call) or not isinstance(tree.func, ast.Name):
+        raise ValueError("not a list of arguments")
+    args = tuple(literal(node) for node in tree.args)
+    kwargs: dict[str, Any] = {}
+    for keyword in tree.keywords:
+        if keyword.arg is None:
+            raise ValueError("** is not allowed")
+        kwargs[keyword.arg] = literal(keyword.value)
+    return args, kwargs
+
+
+def _apply_units(text: str, schema: ActionSchema) -> str:
+    """Multiply every `number unit` outside quotes by the unit's factor."""
+    if not schema.units:
+        return text
+    pattern = _unit_pattern(tuple(schema.units))
+    return _outside_quotes(
+        text, lambda part: pattern.sub(lambda m: repr(float(m.group(1)) * schema.units[m.group(2)]), part)
+    )
+
+
+def _outside_quotes(text: str, change: Any) -> str:
+    parts = _QUOTED.split(text)
+    parts[::2] = [change(part) for part in parts[::2]]
+    return "".join(parts)
+
+
+@functools.lru_cache(maxsize=32)
+def _unit_pattern(units: tuple[str, ...]) -> re.Pattern[str]:
+    """A number that is not part of a word, followed by one of `units`."""
+    names = "|".join(re.escape(u) for u in sorted(units, key=len, reverse=True))
+    return re.compile(rf"(?<![\w.])(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+)\s*({names})\b")
+
+
+def literal(node: ast.AST) -> Any:
+    """The value of a literal expression: constants, signed numbers, containers, joined strings, bare words.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if isinstance(node, ast.Constant) and isinstance(node.value, (int, float, str, bool, type(None))):
+        return node.value
+    if isinstance(node, ast.Name) and not node.id.startswith("__"):
+        return _WORDS.get(node.id.casefold(), node.id)
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
+        value = literal(node.operand)
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            return -value if isinstance(node.op, ast.USub) else value
+    if isinstance(node, (ast.List, ast.Tuple, ast.Set)):
+        return [literal(item) for item in node.elts]
+    if isinstance(node, ast.Dict) and all(key is not None for key in node.keys):
+        pairs = zip([k for k in node.keys if k is not None], node.values, strict=True)
+        return {literal(k): literal(v) for k, v in pairs}
+    if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Add, ast.Sub)):
+        left, right = literal(node.left), literal(node.right)
+        if isinstance(left, str) and isinstance(right, str):
+            # "ab" + "cd" is one text; e-scooter without quotes is one word.
+            return left + right if isinstance(node.op, ast.Add) else f"{left}-{right}"
+    raise ValueError(f"only literal values are allowed, not {type(node).__name__}")

@@ -1,0 +1,160 @@
+"""Actions that come as data: JSON objects and the tool-call forms of chat models, turned into the text of one call.
+
+Understood are `{"action": "NAME(args)"}`, `{"action": "NAME", "args": {...}}` (or a list, or the parameters beside it),
+`{"name": ..., "arguments": ...}` and what OpenAI, Hermes, Mistral and LangChain wrap around it, `{"NAME": {...}}`, and
+the tags `<function=NAME>`, `<invoke name="NAME">`. A list of calls means its first.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from agentspec.literals import known_name, literal, render_call, scan_arguments
+from agentspec.types import ActionSchema
+
+WRAPPERS = ("tool_calls", "tool_call", "function_call", "function", "call", "actions")
+NAMES = ("action", "action_call", "next_action", "final_action", "command", "tool", "tool_name", "action_name", "name")
+ARGUMENTS = (
+    "args",
+    "arguments",
+    "parameters",
+    "params",
+    "kwargs",
+    "tool_input",
+    "action_input",
+    "action_args",
+    "input",
+)
+THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "analysis", "reason")
+MOST_OBJECTS = 16
+"""Opening brackets that are tried before a text is taken to hold no data."""
+
+_FUNCTION = re.compile(
+    r"<function=([\w.\-]+)>|<invoke\s+name=[\"']([\w.\-]+)[\"']\s*>|\bto=functions\.([\w\-]+)[^{}\n]*"
+)
+_PARAMETER = re.compile(
+    r"<parameter(?:=([\w\-]+)|\s+name=[\"']([\w\-]+)[\"'])\s*>\s*(.*?)\s*</parameter>", re.DOTALL | re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An action found as data: the text of its call (or of a menu entry), where it begins, and a thought beside it."""
+
+    text: str
+    start: int
+    thought: str = ""
+
+
+def find_shape(text: str, schema: ActionSchema, start: int = 0) -> Shape | None:
+    """The first action given as data in `text` from `start` on."""
+    tag = _FUNCTION.search(text, start)
+    tagged = _from_tag(text, tag, schema) if tag else None
+    tried = 0
+    for match in re.finditer(r"[{\[]", text[start:]):
+        at, tried = start + match.start(), tried + 1
+        if (tagged and at > tagged.start) or tried > MOST_OBJECTS:
+            break
+        data = _decode(text, at)
+        found = from_data(data, schema) if isinstance(data, dict | list) else None
+        if found is not None:
+            return Shape(found, at, _thought(data))
+    return tagged
+
+
+def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | None:
+    name = known_name(next(g for g in tag.groups() if g), schema)
+    if name is None:
+        return None
+    rest = text[tag.end() :].split("</function>", maxsplit=1)[0].split("</invoke>", maxsplit=1)[0]
+    kwargs: dict[str, Any] = {a or b: _scalar(value) for a, b, value in _PARAMETER.findall(rest)}
+    brace = rest.find("{")
+    data = _decode(rest, brace) if not kwargs and brace >= 0 else None
+    return Shape(_build(name, data if isinstance(data, dict) else kwargs, schema), tag.start())
+
+
+def _scalar(text: str) -> Any:
+    """A parameter between tags: JSON where it is a list or an object, otherwise the text itself."""
+    if text[:1] in "[{":
+        data = _decode(text, 0)
+        return text if data is None else data
+    return text
+
+
+def _decode(text: str, at: int) -> Any:
+    """The JSON (or Python) data that begins at offset `at`; `None` if it cannot be read."""
+    try:
+        return json.JSONDecoder().raw_decode(text, at)[0]
+    except (ValueError, RecursionError):
+        pass
+    end = scan_arguments(text, at)
+    if end is None:
+        return None
+    try:
+        return literal(ast.parse(text[at:end], mode="eval").body)
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
+        return None
+
+
+def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  # noqa: PLR0911  # one line per shape
+    """The text of the action that `data` stands for, or `None`."""
+    if depth > 4 or not data:
+        return None
+    if isinstance(data, list):
+        return from_data(data[0], schema, depth + 1) if isinstance(data[0], dict | list) else None
+    if not isinstance(data, Mapping):
+        return None
+    keys = {str(key).casefold(): value for key, value in data.items()}
+    for key in (*WRAPPERS, *NAMES):
+        value = keys.get(key)
+        if isinstance(value, dict | list):
+            found = from_data(value, schema, depth + 1)
+            if found is not None:
+                return found
+        elif isinstance(value, str) and (found := _named(key, value, keys, schema)) is not None:
+            return found
+    if len(data) == 1:
+        ((only, value),) = data.items()
+        name = known_name(str(only), schema)
+        if name is not None:
+            return _build(name, value, schema)
+    return None
+
+
+def _named(key: str, value: str, keys: Mapping[str, Any], schema: ActionSchema) -> str | None:
+    """The action named by `value` under `key`, with its arguments from beside it."""
+    value = value.strip()
+    name = known_name(value, schema)
+    if name is None:
+        # A whole call, a menu entry, or what shall be reported as unknown; a bare "name" may be anything's.
+        return value or None if key not in ("name", "call", "function") or "(" in value else None
+    given = next((keys[a] for a in ARGUMENTS if a in keys), None)
+    if given is None:
+        known = {p.casefold(): p for p in schema.actions[name].parameters}
+        given = {known[k]: v for k, v in keys.items() if k in known and k != key}
+    if isinstance(given, str):
+        decoded = _decode(given.strip(), 0) if given.strip()[:1] in ("{", "[") else None
+        if decoded is None and given.strip():
+            return f"{name}({given.strip()})"
+        given = decoded
+    return _build(name, given, schema)
+
+
+def _build(name: str, given: Any, schema: ActionSchema) -> str:
+    if isinstance(given, Mapping):
+        return render_call(name, (), {str(k): v for k, v in given.items() if str(k).isidentifier()}, schema)
+    if isinstance(given, list):
+        alone = len(schema.actions[name].parameters) == 1 and len(given) > 1
+        return render_call(name, (given,) if alone else given, {}, schema)
+    return render_call(name, () if given is None else (given,), {}, schema)
+
+
+def _thought(data: Any) -> str:
+    if not isinstance(data, Mapping):
+        return ""
+    return next((str(v) for k, v in data.items() if str(k).casefold() in THOUGHTS and isinstance(v, str)), "")

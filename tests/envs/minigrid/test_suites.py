@@ -1,0 +1,80 @@
+"""The paper's ten tasks, suites, and errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from agentspec.envs.minigrid.env import CALLS, MiniGridEnv
+from agentspec.envs.minigrid.search import optimum, shortest_plan
+from agentspec.envs.minigrid.suites import PAPER, SUITES, layout_of
+
+SHARED = Path(__file__).parents[4] / "shared" / "minigrid_optimal.json"
+OPTIMA = [7, 4, 5, 5, 14, 14, 8, 5, 26, 14]
+
+
+def test_the_optima_of_the_ten_tasks_are_found_by_search():
+    assert [optimum(layout.id, layout.seed) for layout in PAPER] == OPTIMA
+    assert [layout.optimal for layout in PAPER] == OPTIMA
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason=f"{SHARED} is absent: recorded plans of the ten tasks")
+@pytest.mark.parametrize("layout", PAPER, ids=lambda layout: layout.name)
+def test_recorded_plans_solve_the_ten_tasks(layout):
+    recorded = json.loads(SHARED.read_text())[layout.name]
+    assert (recorded["env_id"], recorded["seed"], recorded["optimal_steps"]) == (layout.id, layout.seed, layout.optimal)
+    words = {"left": 0, "right": 1, "forward": 2, "pickup": 3, "drop": 4, "toggle": 5, "done": 6}
+    env = MiniGridEnv(task=layout.name)
+    _, info = env.reset(seed=5)
+    assert info["state"]["mission"] == recorded["mission"]
+    for word in recorded["plan"]:
+        _, _, terminated, _, info = env.step(list(CALLS)[words[word]] + "()")
+    assert terminated and info["metrics"]["success"] == 1.0 and info["metrics"]["efficiency"] == 1.0
+
+
+def test_the_paper_suite_cycles_and_the_others_vary_the_layout():
+    assert layout_of(suite="paper", seed=13) == PAPER[3]
+    assert layout_of(suite="memory", seed=4).id == SUITES["memory"][1]
+    assert layout_of(suite="memory", seed=4).seed == 4
+    assert layout_of(level="BabyAI-GoToObj-v0", seed=9).seed == 9
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "neither suite, level nor task"),
+        ({"suite": "paper", "task": "x"}, "suite and task"),
+        ({"suite": "papr"}, "did you mean paper"),
+        ({"level": "MiniGrid-Empty-6x6-v9"}, "did you mean MiniGrid-Empty-6x6-v0"),
+        ({"task": "empty_6x6_seed43"}, "did you mean empty_6x6_seed42"),
+    ],
+)
+def test_unknown_layouts_are_refused_with_the_nearest_name(given, message):
+    with pytest.raises(ValueError, match=message):
+        layout_of(**given)
+
+
+def test_the_search_leaves_the_world_untouched():
+    env = MiniGridEnv(suite="memory")
+    env.reset(seed=2)
+    env.step("FORWARD()")
+    before = (env.world.grid.encode().tolist(), tuple(env.world.agent_pos), env.world.step_count, env.world.max_steps)
+    plan = shortest_plan(env.world)
+    assert plan and before == (
+        env.world.grid.encode().tolist(),
+        tuple(env.world.agent_pos),
+        env.world.step_count,
+        env.world.max_steps,
+    )
+    for action in plan:
+        *_, info = env.step(list(CALLS)[action] + "()")
+    assert info["success"]
+
+
+def test_a_mission_that_cannot_be_fulfilled_any_more_has_no_plan():
+    env = MiniGridEnv(task="fetch_5x5_n2_seed99")
+    env.reset()
+    env.world.max_steps = 10
+    assert shortest_plan(env.world, most_states=3) is None
