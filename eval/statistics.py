@@ -295,7 +295,7 @@ def interactions(
     missing = [pair for pair in itertools.product(first, second) if pair not in present]
     if len(first) < 2 or len(second) < 2 or len(clusters) < 2 or missing:
         raise ValueError(
-            f"interactions of {factors[0]} ({len(first)}) and {factors[1]} ({len(second)}) over {len(clusters)} clusters "
+            f"interactions of {factors[0]} ({len(first)}) and {factors[1]} ({len(second)}), {len(clusters)} clusters, "
             f"need two of each, every combination; missing: {missing or 'none'}"
         )
     pairs = list(itertools.product(first[1:], second[1:]))

@@ -168,7 +168,7 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
 def _compared(
     before: Mapping[str, float], after: Sequence[Mapping[str, float]], gain: Estimate, digits: int
 ) -> list[str]:
-    """Cells of one row, from values by task of the start and of each run; a task that any of them lacks is left out."""
+    """Cells of one row, from values by task of the start and of each run; a task that one of them lacks is out."""
     from eval.statistics import mean_interval, runs_mean
     from eval.tables import show
 
