@@ -156,7 +156,7 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
     lines = [
         f"# {primary.heading} before and after training",
         "",
-        "Greedy, on held-out tasks, paired by task. 95 % t intervals: per seed over tasks (about that checkpoint only),",
+        "Greedy, on held-out tasks, paired by task. 95 % t intervals: per seed over tasks (that checkpoint only),",
         "for all seeds over training runs. p-values of the gains over runs, Holm over the table; above 0.05 is a tie.",
         "",
         *table(header, body),
