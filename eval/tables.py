@@ -15,9 +15,11 @@ from typing import Any
 
 from agentspec.files import write_atomic
 from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
-from eval.statistics import Estimate, bootstrap, paired_difference
+from eval.statistics import Estimate, corrected, mean_interval, paired
 
 Row = Mapping[str, Any]
+
+DIFFERENCES = "t interval over tasks; p of a sign-flip test, Holm over the table; about these checkpoints only"
 
 
 @dataclass(frozen=True)
@@ -51,12 +53,12 @@ def values_by_task(rows: Iterable[Row], metric: str) -> dict[str, float]:
     return {task: math.fsum(values) / len(values) for task, values in found.items()}
 
 
-def summarise(rows: Sequence[Row], *, level: float = 0.95, seed: int = 0) -> list[CellSummary]:
+def summarise(rows: Sequence[Row], *, level: float = 0.95) -> list[CellSummary]:
     """All cells, in the order of their first rows; metrics without any number are left out of ``estimates``."""
     cells = []
     for (tasks, policy, scaffold), members in _grouped(rows).items():
         values = {metric.name: list(values_by_task(members, metric.name).values()) for metric in columns(members)}
-        estimates = {name: bootstrap(v, level=level, seed=seed) for name, v in values.items() if v}
+        estimates = {name: mean_interval(v, level=level) for name, v in values.items() if v}
         failed = sum(r["status"] != "completed" for r in members)
         cut = sum(r["status"] == "completed" and r.get("ended") in CUT_SHORT for r in members)
         shown = tuple(metric for metric in columns(members) if metric.name in estimates)
@@ -69,6 +71,8 @@ def differences(
 ) -> list[dict[str, Any]]:
     """Paired differences to the first policy under the same scaffold (``by="scaffold"``: to the first scaffold).
 
+    The p-values are corrected over the whole table, and ``tie`` says whether a difference was shown at ``level``.
+
     Raises:
         ValueError: ``by`` is neither ``"policy"`` nor ``"scaffold"``.
     """
@@ -79,14 +83,15 @@ def differences(
     for (tasks, policy, scaffold), members in _grouped(rows).items():
         varied, held = (policy, scaffold) if by == "policy" else (scaffold, policy)
         found.setdefault((tasks, held), {})[varied] = values_by_task(members, metric)
-    table = []
+    named: list[tuple[dict[str, Any], Estimate]] = []
     for (tasks, held), values in found.items():
         baseline = next(iter(values))
         for name, mine in values.items():
             if name != baseline:
-                estimate = paired_difference(mine, values[baseline], level=level, seed=seed)
-                table.append({"tasks": tasks, fixed: held, by: name, "baseline": baseline, **estimate.to_data()})
-    return table
+                compared = paired(mine, values[baseline], level=level, seed=seed)
+                named.append(({"tasks": tasks, fixed: held, by: name, "baseline": baseline}, compared))
+    estimates = corrected([compared for _, compared in named])
+    return [{**names, **e.to_data(), "tie": e.tie(level)} for (names, _), e in zip(named, estimates, strict=True)]
 
 
 def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
@@ -99,13 +104,14 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
         cells = summarise(members, level=level)
         metric = primary_metric(members)
         primary, heading, digits = metric.name, metric.heading, metric.digits
-        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} bootstrap interval.", ""]
+        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} t interval.", ""]
         parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
         for by in ("policy", "scaffold"):
             compared = differences(members, primary, by=by, level=level)
             if compared:
-                parts += [f"Paired differences in {heading}, by {by}:", "", *_differences(compared, by, digits), ""]
+                parts += [f"Paired differences in {heading}, by {by} ({DIFFERENCES}):", ""]
+                parts += [*_differences(compared, by, digits), ""]
     return "\n".join(parts)
 
 
@@ -183,8 +189,10 @@ def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
     for row in rows:
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), str(row["n"])])
-    return table([fixed, "difference", "mean", "tasks"], body)
+        p = "–" if row["p"] is None else f"{row['p']:.3f}"
+        verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
+        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, str(row["n"])])
+    return table([fixed, "difference", "mean", "p", "verdict", "tasks"], body)
 
 
 def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

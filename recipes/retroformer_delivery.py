@@ -68,7 +68,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     A first trial that was good enough has no second one: it counts with its own return, and a gain of 0. Tasks with a
     trial that failed to run are left out.
     """
-    from eval.statistics import bootstrap, paired_difference
+    from eval.statistics import mean_interval, paired
     from eval.tables import show, table
 
     body, gains = [], {}
@@ -76,16 +76,16 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         members = [r for r in rows if r["reflector"] == label]
         played = [r for r in members if r["first_return"] is not None and r["second_return"] is not None]
         gains[label] = {r["task"]: r["second_return"] - r["first_return"] for r in played}
-        returns = [bootstrap([r[key] for r in played]) for key in ("first_return", "second_return")]
+        returns = [mean_interval([r[key] for r in played]) for key in ("first_return", "second_return")]
         lessons = sum(bool(r["lesson"]) for r in played)
-        numbers = [show(e, 2) for e in (*returns, bootstrap(list(gains[label].values())))]
+        numbers = [show(e, 2) for e in (*returns, mean_interval(list(gains[label].values())))]
         body.append([label, str(len(played)), str(lessons), *numbers])
     first, *others = gains
-    difference = [show(paired_difference(gains[label], gains[first]), 2) for label in others]
+    difference = [show(paired(gains[label], gains[first]), 2) for label in others]
     lines = [
         "# What lessons are worth",
         "",
-        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% bootstrap interval.",
+        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% t interval.",
         "",
         *table(["reflector", "tasks", "lessons", "first trial", "second trial", "gain"], body),
         "",
