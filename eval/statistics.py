@@ -74,8 +74,7 @@ class Estimate:
         return {**clean, "n": self.n, "unit": self.unit, "note": self.note}
 
 
-# -- means and paired differences over task seeds
-# -----------------------------------------------------------------------
+# -- means and paired differences over task seeds --------------------------------------------------
 
 
 def mean_interval(values: Values, *, level: float = LEVEL, unit: str = "seed") -> Estimate:
@@ -168,8 +167,7 @@ def performance_profile(values: Values, thresholds: Values) -> list[float]:
     return [float(np.mean(data > threshold)) if data.size else math.nan for threshold in thresholds]
 
 
-# -- training runs
-# ------------------------------------------------------------------------------------------------------
+# -- training runs ---------------------------------------------------------------------------------
 
 
 def runs_mean(runs: Sequence[Mapping[K, float]], *, level: float = LEVEL) -> Estimate:
@@ -219,8 +217,7 @@ def _welch(a: Values, b: Values, level: float) -> Estimate:
     return Estimate(mean, float(interval.low), float(interval.high), min(len(a), len(b)), "run", float(found.pvalue))
 
 
-# -- tables, designs and interactions
-# -----------------------------------------------------------------------------------
+# -- tables, designs and interactions --------------------------------------------------------------
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -314,15 +311,15 @@ def interactions(
     fitted = sm.OLS(values, design).fit(cov_type="cluster", cov_kwds={"groups": groups}, use_t=True)
     bounds = fitted.conf_int(alpha=1 - level)
     start = 1 + len(columns) - len(pairs)
-    found = [
-        Estimate(float(fitted.params[j]), *map(float, bounds[j]), len(clusters), cluster, float(fitted.pvalues[j]))
-        for j in range(start, start + len(pairs))
-    ]
+    found = []
+    for j in range(start, start + len(pairs)):
+        low, high = (float(bound) for bound in bounds[j])
+        p = float(fitted.pvalues[j])
+        found.append(Estimate(float(fitted.params[j]), low, high, len(clusters), unit=cluster, p=p))
     return dict(zip(pairs, corrected(found), strict=True))
 
 
-# -- helpers
-# ------------------------------------------------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------
 
 
 def _finite(values: Values, level: float) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "eval",
         help="measure policies under scaffolds",
-        description="Play every policy under every scaffold on the same tasks; means with intervals, paired differences with tests.",
+        description="Play every policy under every scaffold on the same tasks: intervals, paired tests.",
     )
     parser.add_argument(
         "--policies",
