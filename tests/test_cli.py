@@ -251,9 +251,9 @@ def test_list_json_has_every_name_with_profile_and_needs(capsys: pytest.CaptureF
         for entry in entries.values():
             assert set(entry["calls"]) == {"retrieve", "store", "step", "episode"}
             assert isinstance(entry["needs"], list) and entry["summary"]
-    assert found["reasoning"]["cot"]["calls"]["step"] == [1, 2]
+    assert found["reasoning"]["cot"]["calls"]["step"] == [1, 4]
     assert main(["list", "reasoning"]) == 0
-    assert "1-2 calls per step" in capsys.readouterr().out
+    assert "1-4 calls per step" in capsys.readouterr().out
 
 
 def test_view_prints_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
