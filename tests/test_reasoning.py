@@ -80,3 +80,20 @@ def test_react_snapshot_renders_its_transcript() -> None:
     _, seen = play(lambda r: "Thought: unique-thought\nAction: WAIT()", {"reasoning": "react", "layout": "snapshot"})
     assert "Thought: unique-thought\nAction: WAIT()\nObservation: ok" in seen[1].messages[-1].text
     assert len(seen[4].messages) == 2
+
+
+def test_the_names_of_the_papers_site_are_understood() -> None:
+    from agentspec.registry import REGISTRY
+
+    assert REGISTRY.get("memory", "simple").name == "base"
+    assert REGISTRY.get("reasoning", "simple").name == "rule_based"
+    assert REGISTRY.get("reasoning", "none").name == "direct"
+    for name, parameters in {
+        "react": {"max_iterations": 10},
+        "self_consistency": {"num_samples": 5, "sampling_temperature": 0.7},
+        "mad": {"num_agents": 3, "num_rounds": 2},
+        "tot": {"search_strategy": "BFS", "evaluation_strategy": "value", "num_thoughts": 3},
+        "rap": {"num_iterations": 10},
+        "lats": {"num_iterations": 30, "max_depth": 7, "n_generate_sample": 5},
+    }.items():
+        assert AgentSpec.from_data({"reasoning": {"name": name, **parameters}}).reasoning.name == name

@@ -31,7 +31,8 @@ USED = {
     "run and its folder": "output_dir run_name seed full_determinism use_cpu restore_callback_states_from_checkpoint "
     "push_to_hub hub_model_id hub_strategy hub_token hub_private_repo hub_always_push hub_revision",
     "rollouts and updates": "num_generations per_device_train_batch_size gradient_accumulation_steps "
-    "steps_per_generation generation_batch_size num_iterations max_steps num_train_epochs shuffle_dataset",
+    "steps_per_generation generation_batch_size num_iterations max_steps num_train_epochs shuffle_dataset "
+    "chat_template_kwargs",
     "loss": "loss_type beta epsilon epsilon_high delta top_entropy_quantile use_bias_correction_kl "
     "max_completion_length",
     "optimiser and schedule": "learning_rate lr_scheduler_type lr_scheduler_kwargs warmup_steps optim optim_args "
@@ -79,7 +80,6 @@ _SCRIPT = "no script reads it: a recipe trains, validates (`eval_strategy`) and 
 
 REFUSED = {
     _SAMPLING: "temperature top_p top_k min_p repetition_penalty generation_kwargs vllm_structured_outputs_regex",
-    "the agent writes its prompts, in the template of the tokenizer that `model` brings": "chat_template_kwargs",
     "weights belong to names: set `rewards: {name: weight}`": "reward_weights",
     _MODEL: "model_init_kwargs",
     "code that comes with a model is not run; convert the model to one that transformers knows": "trust_remote_code",

@@ -25,6 +25,7 @@ class Direct(Stateless):
         "answers with the action only",
         calls=CallProfile(step=(1, 3)),
         purposes=Purpose.each("step", "act"),
+        aliases=("none",),
     )
 
     def __init__(self, services: Services, max_retries: int = MAX_RETRIES) -> None:

@@ -73,7 +73,7 @@ class SelfConsistency(Stateless):
 
     Args:
         preset: `paper` (5 samples, as AgentSpec) or `rl` (3).
-        samples: chains per decision.
+        samples: chains per decision; `num_samples` is another name for it.
         sampling_temperature: temperature of the chains; above 0, or they would not be independent.
         credit: which completions are credited as executed: those of the answer `returned`, or of the whole
             `majority`; the others are credited as explored.
@@ -94,12 +94,13 @@ class SelfConsistency(Stateless):
         services: Services,
         preset: str = "paper",
         samples: int | None = None,
+        num_samples: int | None = None,
         sampling_temperature: float = 0.7,
         credit: str = "returned",
         thought_tokens: int | None = None,
         max_retries: int = MAX_RETRIES,
     ) -> None:
-        chosen = settings("self_consistency", PRESETS, preset, {"samples": samples})
+        chosen = settings("self_consistency", PRESETS, preset, {"samples": num_samples if samples is None else samples})
         at_least("self_consistency", 1, samples=chosen["samples"])
         at_least("self_consistency", 0, max_retries=max_retries)
         require_variety("self_consistency", services, sampling_temperature)

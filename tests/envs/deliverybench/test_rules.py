@@ -272,6 +272,13 @@ def test_quirk_bare_numbers_are_cm() -> None:
         assert math.dist(w.state.position, (x, y)) < 500.0
 
 
+def test_quirk_strict_reading() -> None:
+    one_line = '```json {"action": "VIEW_BAG()"} ```'
+    refuse(world("original"), one_line, "PARSE_NOT_CALL")
+    do(world("original"), one_line.replace(" {", "\n{").replace("} ", "}\n"))
+    do(world("fair"), one_line)
+
+
 def test_quirk_handoff_hidden() -> None:
     for rules in BOTH:
         w = world(rules, seed=3)

@@ -8,6 +8,7 @@ event to event (see `clock`), so a step costs the same whether it takes a second
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ from agentspec.envs.deliverybench.world.settlement import Settlement
 from agentspec.envs.deliverybench.world.shift import Shift
 from agentspec.envs.deliverybench.world.snapshot import dump, load
 from agentspec.types import Action, ActionError
+
+_ONE_LINE_FENCE = re.compile(r"```[^\n]*```")
 
 RETRIES = 5
 
@@ -96,7 +99,7 @@ class World(Shift):
         ENDED).
         """
         state = self.state
-        action = text if isinstance(text, Action) else parse_action(text, self.schema)
+        action = text if isinstance(text, Action) else self._read(text)
         start, delivered = state.tick, len(state.settlements)
         if state.ended:
             return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
@@ -125,6 +128,11 @@ class World(Shift):
         if not over and self.max_calls is not None and state.calls >= self.max_calls:
             end_episode(self, "calls")
         return self._outcome(None if over else True, "", message, start, delivered, action)
+
+    def _read(self, text: str) -> Action | ActionError:
+        if self.rules.strict_reading and _ONE_LINE_FENCE.fullmatch(text.strip()):
+            return ActionError("PARSE_NOT_CALL", "a code fence needs lines of its own; write the call alone", "")
+        return parse_action(text, self.schema)
 
     def _think(self, seconds: float) -> bool:
         """Count a call and let the seconds of deliberation pass; whether the shift goes on."""

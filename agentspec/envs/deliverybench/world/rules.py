@@ -120,6 +120,7 @@ class Rules:
     bare_pickup_fails: bool = quirk("PICKUP() without a list never works, although one order may be ready here.")
     zero_id_fails: bool = quirk("ACCEPT_ORDER(order_id=0) is unreadable because 0 counts as missing.")
     bare_numbers_are_cm: bool = quirk("Coordinates without the unit m are centimetres.")
+    strict_reading: bool = quirk("A code fence that stands on one line with what it holds is unreadable.")
     handoff_hidden: bool = quirk("The point where a customer takes the food by hand is never told.")
     odd_bus_line: bool = quirk("The bus serves the terminal twice and uses wrong leg lengths on the way back.")
     stale_error: bool = quirk("A move that fails silently leaves the previous error text standing.")
