@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,13 @@ def main() -> None:
     evaluate_run(config, Path(config.output_dir))
 
 
+def _unscored(runner: Any, jobs: Any) -> list[Any]:
+    """The jobs' episodes; their returns are read off the metrics, so nothing scores them."""
+    from trainers.credit import ScoredEpisode
+
+    return [ScoredEpisode(trajectory, None) for trajectory in runner.run(jobs)]
+
+
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     """Two trials of every held-out task with either reflector: rows, also in `folder` with their table."""
     from agentspec.episode import Job, Runner
@@ -49,7 +57,8 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     for label, run in (("before training", ""), ("after training", folder)):
         model, tokenizer = load_actor_and_reflector(config, run)
         runner = Runner(spec, routed_llm(model, tokenizer), timeout_s=config.env_timeout_s, policy=label)
-        firsts, lasts = play_trials(runner.run, jobs)
+        played = play_trials(partial(_unscored, runner), jobs)
+        firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):
             returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]
             lesson = [c.text for c in last.calls if c.tag.purpose == "reflect"] if has_lesson(last) else []
