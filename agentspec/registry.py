@@ -207,10 +207,10 @@ class Registry:
             importlib.import_module(f"{self._package}.envs")  # registers its own when imported
             return []
         package = importlib.import_module(f"{self._package}.{kind}")
-        return [m.name for m in pkgutil.iter_modules(package.__path__) if not m.ispkg]
+        return [m.name for m in pkgutil.iter_modules(package.__path__)]
 
     def _from_file(self, kind: str, name: str) -> None:
-        """Register what `agentspec/<kind>/<name>.py` declares: the class without a name of its own gets the file's."""
+        """Register what `<name>.py` or `<name>/__init__.py` declares: the class without a name of its own gets this."""
         module = importlib.import_module(f"{self._package}.{kind}.{name}")
         for cls in _declared(module):
             called = cls.declaration.name or name
