@@ -42,6 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "rl": {"every": 16, "overview_every": 0, "answer_tokens": 128, "steps_tokens": 768},
 }
 TASK_TOKENS = 64
+NEXT_EPISODE = "[Plan for the next episode]"
 
 HEAD = (
     "You keep the memory of an agent that acts in an environment. Its task and its latest steps follow.\n\n"
@@ -55,7 +56,7 @@ CONCLUDE = (
     "\n\nInsights so far:\n{known}\n\nWhat do the steps show about this environment that will hold again? Give costs, "
     "durations and thresholds as numbers; repeat nothing that is known; invent nothing. Answer with JSON:\n"
     '{{"insights": [at most 3 sentences], "avoid": [at most 2 things not to do, and why], '
-    '"next": [the 3 things to do next, in order]}}'
+    '"next": [the 3 things to do {next}, in order]}}'
 )
 OVERVIEW = (
     "You keep the memory of an agent that acts in an environment. Merge its overview with the newer notes into one "
@@ -174,7 +175,7 @@ class MemoryBank:
         self.entries: dict[int, Entry] = {}
         self.overview = ""
         self._merged: list[int] = []  # summaries and insights that are not in the overview yet
-        self._next: list[str] = []
+        self._plan = ""
         self._days, self._last_pass = 0, 0
         self._day_began, self._held_from = 0, 0  # steps of this episode
         self._task = ""
@@ -183,7 +184,8 @@ class MemoryBank:
 
     def begin_episode(self, task: Task) -> None:
         self._day_began, self._held_from = 0, 0
-        self._next = []
+        if not self._plan.startswith(NEXT_EPISODE):
+            self._plan = ""
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """Overview, insights, summaries and steps that fit the observation, the newest steps; recall strengthens."""
@@ -196,8 +198,8 @@ class MemoryBank:
         items = [RecallItem(f"[Overview] {self.overview}", 1.0, "summary", priority=3.0)] if self.overview else []
         order = sorted(found, key=lambda hit: (KINDS.index(self.entries[hit[0]].kind), hit[0]))
         items += [self._item(key, score) for key, score in order]
-        if self._next:
-            items.append(RecallItem("[Next] " + "; ".join(self._next), 1.0, "insight", priority=2.5))
+        if self._plan:
+            items.append(RecallItem(self._plan, 1.0, "insight", priority=2.5))
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
             items += [RecallItem(self._named(e), 1.0, priority=4.0 + e.step) for e in newest]
@@ -227,7 +229,9 @@ class MemoryBank:
             self._merged.append(self._add("summary", summary, step - 1))
         for text in (*found.insights[:3], *(f"Avoid: {a}" for a in found.avoid[:2])):
             self._learn(text, step - 1)
-        self._next = [self._clip(text) for text in found.next[:3]] or self._next
+        if found.next:
+            label = NEXT_EPISODE if ending else f"[Plan after step {step}]"
+            self._plan = f"{label} {'; '.join(self._clip(text) for text in found.next[:3])}"
         self._days += 1
         self._day_began = step
         if self.writer == "llm" and self.overview_every and self._days % self.overview_every == 0:
@@ -242,7 +246,8 @@ class MemoryBank:
         known = newest_within([f"- {text}" for text in known], self.answer_tokens, count)
         prompts = (
             head + SUMMARISE.format(words=self.answer_tokens // 3),
-            head + CONCLUDE.format(known="\n".join(known) or "(none)"),
+            head
+            + CONCLUDE.format(known="\n".join(known) or "(none)", next="in the next episode" if ending else "next"),
         )
         summary, found = await asyncio.gather(
             self.services.ask("summary", prompts[0], self.answer_tokens),
@@ -371,10 +376,10 @@ class MemoryBank:
     def snapshot(self) -> bytes:
         entries = [[key, list(asdict(entry).values())] for key, entry in self.entries.items()]
         times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
-        return dump_state([entries, self.overview, self._merged, self._next, self._task, times])
+        return dump_state([entries, self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
-        entries, self.overview, self._merged, self._next, self._task, times = load_state(blob)
+        entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)
         self._days, self._last_pass, self._day_began, self._held_from, self._forgotten = times
         self.entries = {key: Entry(*values) for key, values in entries}
         for kind, index in self._index.items():

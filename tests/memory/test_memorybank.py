@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from agentspec.memory.memorybank import Entry, MemoryBank, avoid_by_rule, by_rule, retention
 from agentspec.registry import SpecError
-from tests.memory.by_hand import Asked, episode, learn, recall, services, step
+from tests.memory.by_hand import TASK, Asked, episode, learn, recall, services, step
 from tests.memory.recall_world import succeeds
 
 CONCLUDED = '{"insights": ["WAIT costs 1 % of energy."], "avoid": ["TAKE with full hands"], "next": ["GO", "TAKE"]}'
@@ -85,7 +85,7 @@ def test_a_day_is_summarised_and_mixed_at_recall() -> None:
         "[Trajectory Summary] Went and took a box.",
         "Step 1: GO(0) -> done | in: room 0",
         "Step 2: GO(1) -> done (+1.00) | in: room 1",
-        "[Next] GO; TAKE",
+        "[Plan after step 3] GO; TAKE",
         "Step 3: GO(2) -> done | in: room 2",
     ]
 
@@ -156,7 +156,10 @@ def test_the_episode_end_is_written_only_for_a_later_one() -> None:
         learn(memory, *steps)
         asyncio.run(memory.end_episode(episode(*steps, success=True)))
         assert len(asked.requests) == calls
-    # 2 steps, 0 + 1 reward.
+        if carried:  # 2 steps, 0 + 1 reward; what to do next is now a matter of the next episode
+            assert "The episode ended after 2 steps with a return of +1.00, a success." in asked.prompt()
+            memory.begin_episode(TASK)
+            assert "[Plan for the next episode] GO; TAKE" in recall(memory, "a")
     asyncio.run(bank(asked).end_episode(episode()))
 
 
