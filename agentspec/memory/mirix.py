@@ -57,8 +57,8 @@ HEAD = (
 ROUTE = '\n\nWhich stores do these steps add to, or correct? Answer with JSON:\n{{"stores": [names; empty if none]}}'
 RELATED_TO = "\n\nEntries that may be about the same:\n{entries}"
 EDIT = (
-    "\n\nEdit the store `{store}`. Make one edit: insert (a new entry), merge (add to the entry of that id), update (put "
-    "new texts in place of those of that id), or none. Keep numbers, ids and places. Answer with JSON:\n"
+    "\n\nEdit the store `{store}`. Make one edit: insert (a new entry), merge (add to the entry of that id), update "
+    "(put new texts in place of those of that id), or none. Keep numbers, ids and places. Answer with JSON:\n"
     '{{"op": "insert" | "merge" | "update" | "none", "id": number or null, "fields": {{{fields}}}}}'
 )
 EDIT_ALL = (
