@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from agentspec.context import Context
 from agentspec.llm.base import ContextOverflowError
+from agentspec.llm.pictures import picture
 from agentspec.llm.recorder import BudgetExceededError, Recorder
 from agentspec.protocols import Measured, Memory, Perception, Reasoning, Reflection, Services, Simulator, StepClock
 from agentspec.state import dump_state, load_state
@@ -65,6 +66,7 @@ class Agent:
         """
         self.recorder.step = self.clock.step
         agent_input = self.perception.perceive(task, observation, info)
+        self.context.pictures = tuple(map(picture, agent_input.images))
         try:
             recall = await self._or("memory", self.memory.retrieve(agent_input), Recall())
             lessons = await self._or("reflection", self.reflection.lessons(agent_input), Recall())

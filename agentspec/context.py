@@ -19,7 +19,7 @@ from typing import Any, Literal
 from agentspec.llm.base import Message, assistant, system, user
 from agentspec.state import dump_state, load_state
 from agentspec.tokens import CountTokens, estimate_tokens
-from agentspec.types import Part, Recall, Sampled
+from agentspec.types import Part, Picture, Recall, Sampled
 
 Layout = Literal["conversation", "snapshot"]
 Placement = Literal["newest", "kept"]
@@ -64,6 +64,8 @@ class Context:
         self.lesson_tokens = lesson_tokens
         self.window = window
         self.carry = ""
+        self.pictures: tuple[Picture, ...] = ()
+        """What the current step sees: part of its prompts, and of nothing that is kept."""
         self._count = count_tokens
         self._static = ""
         self._turns: list[Message] = []
@@ -167,7 +169,10 @@ class Context:
 
     def snapshot(self) -> bytes:
         """Exact state as bytes."""
-        turns = [{"role": m.role, "content": [_part_to_json(p) for p in m.content]} for m in self._turns]
+        turns = [
+            {"role": m.role, "content": [_part_to_json(p) for p in m.content if not isinstance(p, Picture)]}
+            for m in self._turns
+        ]
         opened = None if self._open is None else self._open.text
         return dump_state(
             {
@@ -194,6 +199,9 @@ class Context:
         turns = [*self._turns, *more]
         if self.carry and turns:
             turns[0] = user(f"{self.carry}\n\n{turns[0].text}")
+        if self.pictures and self._running:
+            first = self._steps[-1]
+            turns[first] = user(turns[first].text, *self.pictures)
         return (system(self._static), *turns)
 
     def _start(self, keep: int) -> int:

@@ -72,6 +72,9 @@ PLAIN = {metric.name: metric for metric in (SUCCESS, *SCAFFOLD)}
 CUT_SHORT = ("budget", "context")
 """Ends of an episode that the scaffold brought about, not the environment: counted beside the means."""
 
+_ROW = frozenset({"seed", "rollout", "input_tokens", "output_tokens", "thinking_s"})
+"""Numbers of a row that are no metrics."""
+
 _COUNTED = ("invalid_actions", "llm_calls", "cached_tokens", "input_tokens", "output_tokens", "thinking_s", "ended")
 
 
@@ -102,14 +105,24 @@ def _metadata(env: str) -> Mapping[str, Any]:
 def columns(rows: Iterable[Row]) -> tuple[Metric, ...]:
     """The metrics of `rows`, in the order of tables: what their environments declare, success, then the scaffold's.
 
-    Only those that at least one row has a number for.
+    Only those that at least one row has a number for. Rows of an environment that is not registered here keep their
+    figures, under plain names.
     """
     rows = list(rows)
     found: dict[str, Metric] = {}
     for env in dict.fromkeys(str(row.get("env", "")) for row in rows):
-        found |= {metric.name: metric for metric in declared(env) if metric.name not in found}
+        stated = declared(env) or _recorded([row for row in rows if row.get("env") == env])
+        found |= {metric.name: metric for metric in stated if metric.name not in found}
     known = {**found, **{name: metric for name, metric in PLAIN.items() if name not in found}}
     return tuple(m for m in known.values() if any(row.get(m.name) is not None for row in rows))
+
+
+def _recorded(rows: Iterable[Row]) -> tuple[Metric, ...]:
+    """Metrics by the names that rows have numbers under and that are not the scaffold's."""
+    names = dict.fromkeys(
+        name for row in rows for name, value in row.items() if name not in _ROW and number(value) is not None
+    )
+    return tuple(Metric(name) for name in names if name not in PLAIN and name.isidentifier())
 
 
 def primary_metric(rows: Iterable[Row]) -> Metric:

@@ -199,7 +199,8 @@ class AgentSpec:
 
     def _needs_of(self, kind: str) -> tuple[str, ...]:
         module: ModuleSpec = getattr(self, kind)
-        return REGISTRY.get(kind, module.name).needs_with(module.params)
+        needs: tuple[str, ...] = REGISTRY.get(kind, module.name).needs_with(module.params)
+        return (*needs, "images") if kind == "perception" and module.params.get("images") else needs
 
     def call_paths(self) -> list[str]:
         """`module/purpose` paths of the calls that the modules may make, as patterns over calls match them."""

@@ -285,6 +285,15 @@ Part = str | Sampled
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A picture in a user turn: PNG bytes, and its size in pixels."""
+
+    png: bytes = field(repr=False)
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
 class LLMCall:
     """Every model call an episode makes: the one record that cost accounting and RL training both read."""
 

@@ -76,7 +76,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.partition("\n")[0])
     parser.add_argument("--sizes", nargs="+", choices=list(PLANS), default=["small"])
     parser.add_argument("--cities", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=2)

@@ -113,7 +113,7 @@ def written(document: str, rows: Sequence[Fact]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the facts, and write them into a document where asked to."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.partition("\n")[0])
     parser.add_argument("--maps", type=Path, default=MAPS)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", type=Path, help="document whose marked section is replaced")

@@ -150,7 +150,9 @@ def agents() -> dict[str, tuple[dict[str, Any], int]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Play and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--max-steps", type=int, default=120, help="most steps of an episode (120)")
     parser.add_argument("--only", nargs="*", default=[], metavar="METHOD", help="these methods only")

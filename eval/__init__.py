@@ -1,13 +1,13 @@
 """Evaluation: policies x scaffolds x tasks on paired seeds, with intervals, tables and plots.
 
 :func:`evaluate` runs the matrix and keeps one JSON line per episode; :mod:`eval.tables` turns the lines into means with
-bootstrap intervals; :mod:`eval.plots` draws them. Only ``agentspec`` is imported here: any policy that can act inside a
-scaffold can be measured, trained by this project or not.
+intervals (:mod:`eval.statistics` says which); :mod:`eval.plots` draws them. Only ``agentspec`` is imported here: any
+policy that can act inside a scaffold can be measured, trained by this project or not.
 """
 
+from agentspec.policies import Policy
 from eval.matrix import evaluate
-from eval.policies import Policy
 from eval.results import Results
-from eval.statistics import Estimate, bootstrap, paired_difference
+from eval.statistics import Estimate, mean_interval, paired
 
-__all__ = ["Estimate", "Policy", "Results", "bootstrap", "evaluate", "paired_difference"]
+__all__ = ["Estimate", "Policy", "Results", "evaluate", "mean_interval", "paired"]

@@ -19,18 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.actions import suggest
+from agentspec.carry import MemoryBank, play_in_order, start_bank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
+from agentspec.metrics import episode_row
+from agentspec.policies import Policy
 from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tasks import Tasks, task_sets
 from agentspec.trajectory import Trajectory, jsonable, write_trajectories
 from agentspec.types import Sampling, Task
-from eval.metrics import episode_row
-from eval.policies import Policy
 from eval.results import Results
-from eval.tasks import Tasks, task_sets
 
 MakeLLM = Callable[[Policy], LLM | None]
 
@@ -50,6 +51,8 @@ class Settings:
         max_steps: most steps of an episode, on top of the environment's own limit.
         prices: dollars per token, by model name.
         trajectories: keep every episode under ``trajectories/``.
+        start_memory: for scaffolds with ``scope: run``, a memory file or the folder of a run that wrote one: every
+            chain of episodes starts from it. A mapping gives policies, by name, starts of their own; others have none.
         retry_failed: play cells again whose line says that they failed.
         replace_stale: play cells again whose line is from another configuration (retrained weights, say) instead of
             refusing them.
@@ -63,6 +66,7 @@ class Settings:
     max_steps: int | None = None
     prices: Prices = field(default_factory=Prices)
     trajectories: bool = False
+    start_memory: str | Mapping[str, str] = ""
     retry_failed: bool = False
     replace_stale: bool = False
 
@@ -74,6 +78,16 @@ class Settings:
             if name not in names:
                 raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
 
+    def start_of(self, policy: Policy, spec: AgentSpec) -> MemoryBank:
+        """The memory that chains of episodes start from: nothing where nothing outlives an episode, or learns.
+
+        Raises:
+            SpecError: no such file, or one of other modules than the scaffold's.
+        """
+        given = self.start_memory
+        source = given if isinstance(given, str) else given.get(policy.name, "")
+        return start_bank(source if spec.scope == "run" and not policy.scripted else "", spec)
+
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
         return replace(spec, sampling=replace(spec.sampling, **(GREEDY if self.sampling is None else self.sampling)))
@@ -81,13 +95,25 @@ class Settings:
 
 @dataclass(frozen=True)
 class Setting:
-    """One row-and-column pair of the matrix with the jobs that are still to play."""
+    """One row-and-column pair of the matrix with what is still to play.
+
+    Args:
+        fingerprints: task key -> digest of everything that the task's rows depend on.
+        chains: lists of jobs. With `scope: run` the episodes of a chain follow each other and memory runs through.
+        start: what each chain starts from.
+    """
 
     policy: Policy
     scaffold: str
     spec: AgentSpec
-    fingerprint: str
-    jobs: tuple[Job, ...]
+    fingerprints: Mapping[str, str]
+    chains: tuple[tuple[Job, ...], ...]
+    start: MemoryBank
+
+    @property
+    def jobs(self) -> list[Job]:
+        """All jobs."""
+        return [job for chain in self.chains for job in chain]
 
 
 def evaluate(
@@ -102,7 +128,7 @@ def evaluate(
     on_row: Callable[[dict[str, Any]], None] | None = None,
     **changes: Any,
 ) -> list[dict[str, Any]]:
-    """Play policies x scaffolds x tasks and return one row per episode (see :func:`eval.metrics.episode_row`).
+    """Play policies x scaffolds x tasks and return one row per episode (see :func:`agentspec.metrics.episode_row`).
 
     Args:
         policies: rows of the matrix; names must differ.
@@ -122,8 +148,14 @@ def evaluate(
             map that is not there), it is raised before anything is played.
     """
     settings = replace(settings or Settings(), **changes)
+    if settings.start_memory and not any(spec.scope == "run" for spec in specs.values()):
+        raise SpecError("start_memory is given, but no scaffold has `scope: run`: every episode would start empty")
     sets = task_sets(tasks)
     _check_names(policies, specs)
+    if isinstance(settings.start_memory, Mapping):
+        for name in settings.start_memory:
+            if name not in (known := [p.name for p in policies]):
+                raise SpecError(f"start_memory names the policy {name!r}{suggest(name, known)}")
     results = Results(out)
     labels = {task.key: label for label, members in sets.items() for task in members}
     plan = [
@@ -142,7 +174,7 @@ def evaluate(
             "policy": setting.policy.name,
             "scaffold": setting.scaffold,
             "tasks": labels[trajectory.task.key],
-            "fingerprint": setting.fingerprint,
+            "fingerprint": setting.fingerprints[trajectory.task.key],
             **episode_row(trajectory),
         }
         results.append(row)
@@ -187,21 +219,10 @@ async def _play(
             on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
         )
         if setting.spec.scope == "run":
-            await _in_order(runner, setting.jobs)
+            for chain in setting.chains:
+                await play_in_order(runner, chain, setting.start)
         else:
             await runner.run_async(setting.jobs)
-
-
-async def _in_order(runner: Runner, jobs: Sequence[Job]) -> None:
-    """One episode after the other, each starting from the memory that the last finished one left."""
-    memory: bytes | None = None
-    rollout = 0
-    for job in jobs:
-        if job.rollout != rollout:
-            memory, rollout = None, job.rollout
-        [trajectory] = await runner.run_async([replace(job, memory_state=memory)])
-        if trajectory.scorable:
-            memory = trajectory.memory_state
 
 
 def _setting(
@@ -218,30 +239,58 @@ def _setting(
         SpecError: the file has lines of this pair from another configuration.
     """
     spec = settings.apply(policy.apply(spec))
-    content = [spec.to_data(), policy.identity(), settings.seed, settings.max_steps]
-    text = json.dumps(jsonable(content), sort_keys=True)
-    fingerprint = hashlib.sha256(text.encode()).hexdigest()[:12]
-    every = [
-        Job(task, rollout, settings.seed)
-        for rollout in range(settings.rollouts)
+    start = settings.start_of(policy, spec)
+    fingerprints = _fingerprints(
+        [spec.to_data(), policy.identity(), settings.seed, settings.max_steps], spec, sets, start
+    )
+    left: list[tuple[Job, ...]] = []
+    for rollout in range(settings.rollouts):
+        for members in sets.values():
+            chain = tuple(Job(task, rollout, settings.seed) for task in members)
+            missing = tuple(j for j in chain if _is_missing(policy, label, j, fingerprints, settings, results))
+            if missing:  # memory that runs on cannot be entered in the middle
+                left.append(chain if spec.scope == "run" else missing)
+    return Setting(policy, label, spec, fingerprints, tuple(left), start)
+
+
+def _fingerprints(
+    content: list[Any], spec: AgentSpec, sets: Mapping[str, Sequence[Task]], start: MemoryBank
+) -> dict[str, str]:
+    """Task key -> digest of what its rows depend on: with `scope: run` also the start and the tasks before it."""
+
+    def digest(*more: Any) -> str:
+        text = json.dumps(jsonable([*content, *more]), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    if spec.scope != "run":
+        return {task.key: digest() for members in sets.values() for task in members}
+    began = hashlib.sha256(start.dump()).hexdigest()
+    return {
+        task.key: digest(began, [before.key for before in members[:i]])
         for members in sets.values()
-        for task in members
-    ]
-    left = []
-    for job in every:
-        row = results.by_cell.get((policy.name, label, job.task.key, job.rollout))
-        stale = row is not None and row.get("fingerprint") != fingerprint
-        if stale and not settings.replace_stale:
-            raise SpecError(
-                f"{results.path} holds results of another configuration under policy {policy.name!r} and scaffold "
-                f"{label!r} (spec, weights, sampling or seed differ); choose another output folder or label, or "
-                "replace them (replace_stale)"
-            )
-        if row is None or stale or (settings.retry_failed and row["status"] == "failed"):
-            left.append(job)
-    if left and spec.scope == "run":
-        left = every  # memory that runs on cannot be entered in the middle
-    return Setting(policy, label, spec, fingerprint, tuple(left))
+        for i, task in enumerate(members)
+    }
+
+
+def _is_missing(
+    policy: Policy, label: str, job: Job, fingerprints: Mapping[str, str], settings: Settings, results: Results
+) -> bool:
+    """Whether a job has no valid row yet.
+
+    Raises:
+        SpecError: it has one from another configuration.
+    """
+    row = results.by_cell.get((policy.name, label, job.task.key, job.rollout))
+    if row is None:
+        return True
+    stale = row.get("fingerprint") != fingerprints[job.task.key]
+    if stale and not settings.replace_stale:
+        raise SpecError(
+            f"{results.path} holds results of another configuration under policy {policy.name!r} and scaffold "
+            f"{label!r} (spec, weights, sampling or seed differ; with `scope: run` also the start memory, or which "
+            "tasks come before); choose another output folder or label, or replace them (replace_stale)"
+        )
+    return stale or (settings.retry_failed and row["status"] == "failed")
 
 
 def _check_names(policies: Sequence[Policy], specs: Mapping[str, AgentSpec]) -> None:

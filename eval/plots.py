@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from agentspec.files import write_atomic
-from eval.metrics import BY_NAME, METRICS
-from eval.tables import CellSummary
+from agentspec.metrics import Metric
+from eval.tables import CellSummary, metrics_of
 
 
 def reward_curve(
@@ -91,7 +91,7 @@ def matrix_heatmap(cells: Sequence[CellSummary], path: str | Path, *, metric: st
     """Draw policy x scaffold, one panel per set of tasks; every field shows its mean and interval.
 
     Args:
-        metric: a column of :data:`eval.metrics.METRICS`; default: the first that any cell has.
+        metric: name of one of the cells' metrics; default: their primary one.
 
     Returns:
         Whether there was anything to draw.
@@ -99,32 +99,32 @@ def matrix_heatmap(cells: Sequence[CellSummary], path: str | Path, *, metric: st
     Raises:
         ValueError: an unknown metric.
     """
-    if metric and metric not in BY_NAME:
-        raise ValueError(f"unknown metric {metric!r}; known: {', '.join(BY_NAME)}")
-    metric = metric or next((m.name for m in METRICS if any(m.name in c.estimates for c in cells)), "")
-    shown = [c for c in cells if metric in c.estimates]
-    if not shown:
+    known = {m.name: m for m in metrics_of(cells)}
+    if metric and known and metric not in known:
+        raise ValueError(f"unknown metric {metric!r}; known: {', '.join(known)}")
+    drawn = known.get(metric) or next(iter(known.values()), None)
+    shown = [c for c in cells if drawn and drawn.name in c.estimates]
+    if not shown or drawn is None:
         return False
     tasks = list(dict.fromkeys(c.tasks for c in shown))
     policies, scaffolds = ([*dict.fromkeys(getattr(c, k) for c in shown)] for k in ("policy", "scaffold"))
     figure, panels = _figure(len(tasks) * (2 + 1.5 * len(scaffolds)), 1.6 + 0.8 * len(policies), len(tasks))
     for axes, label in zip(np.atleast_1d(panels), tasks, strict=True):
-        _panel(figure, axes, [c for c in shown if c.tasks == label], policies, scaffolds, metric)
-        axes.set_title(f"{label}: {BY_NAME[metric].heading}")
+        _panel(figure, axes, [c for c in shown if c.tasks == label], policies, scaffolds, drawn)
+        axes.set_title(f"{label}: {drawn.heading}")
     _save(figure, path)
     return True
 
 
 def _panel(
-    figure: Any, axes: Any, cells: Sequence[CellSummary], policies: list[str], scaffolds: list[str], metric: str
+    figure: Any, axes: Any, cells: Sequence[CellSummary], policies: list[str], scaffolds: list[str], metric: Metric
 ) -> None:
     grid = np.full((len(policies), len(scaffolds)), np.nan)
-    better = BY_NAME[metric].higher_is_better
     for c in cells:
-        grid[policies.index(c.policy), scaffolds.index(c.scaffold)] = c.estimates[metric].mean
-    image = axes.imshow(grid, cmap="viridis" if better else "viridis_r", aspect="auto")
+        grid[policies.index(c.policy), scaffolds.index(c.scaffold)] = c.estimates[metric.name].mean
+    image = axes.imshow(grid, cmap="viridis" if metric.higher_is_better else "viridis_r", aspect="auto")
     for c in cells:
-        e = c.estimates[metric]
+        e = c.estimates[metric.name]
         text = f"{e.mean:.2f}" + ("" if math.isnan(e.low) else f"\n[{e.low:.2f}, {e.high:.2f}]")
         at = (scaffolds.index(c.scaffold), policies.index(c.policy))
         red, green, blue, _ = image.cmap(image.norm(e.mean))

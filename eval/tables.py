@@ -14,15 +14,20 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import write_atomic
-from eval.metrics import BY_NAME, CUT_SHORT, METRICS, primary_metric
-from eval.statistics import Estimate, bootstrap, paired_difference
+from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
+from eval.statistics import Estimate, corrected, mean_interval, paired
 
 Row = Mapping[str, Any]
+
+DIFFERENCES = "t interval over tasks; p of a sign-flip test, Holm over the table; about these checkpoints only"
 
 
 @dataclass(frozen=True)
 class CellSummary:
-    """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it."""
+    """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it.
+
+    `metrics` says what the names in `estimates` are called and whether more is better, the primary one first.
+    """
 
     tasks: str
     policy: str
@@ -31,6 +36,7 @@ class CellSummary:
     failed: int
     cut_short: int
     estimates: Mapping[str, Estimate]
+    metrics: tuple[Metric, ...] = ()
 
     def to_data(self) -> dict[str, Any]:
         """JSON values."""
@@ -47,18 +53,16 @@ def values_by_task(rows: Iterable[Row], metric: str) -> dict[str, float]:
     return {task: math.fsum(values) / len(values) for task, values in found.items()}
 
 
-def summarise(rows: Sequence[Row], *, level: float = 0.95, seed: int = 0) -> list[CellSummary]:
+def summarise(rows: Sequence[Row], *, level: float = 0.95) -> list[CellSummary]:
     """All cells, in the order of their first rows; metrics without any number are left out of ``estimates``."""
     cells = []
     for (tasks, policy, scaffold), members in _grouped(rows).items():
-        estimates = {}
-        for metric in METRICS:
-            values = list(values_by_task(members, metric.name).values())
-            if values:
-                estimates[metric.name] = bootstrap(values, level=level, seed=seed)
+        values = {metric.name: list(values_by_task(members, metric.name).values()) for metric in columns(members)}
+        estimates = {name: mean_interval(v, level=level) for name, v in values.items() if v}
         failed = sum(r["status"] != "completed" for r in members)
         cut = sum(r["status"] == "completed" and r.get("ended") in CUT_SHORT for r in members)
-        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates))
+        shown = tuple(metric for metric in columns(members) if metric.name in estimates)
+        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates, shown))
     return cells
 
 
@@ -66,6 +70,8 @@ def differences(
     rows: Sequence[Row], metric: str, *, by: str = "policy", level: float = 0.95, seed: int = 0
 ) -> list[dict[str, Any]]:
     """Paired differences to the first policy under the same scaffold (``by="scaffold"``: to the first scaffold).
+
+    The p-values are corrected over the whole table, and ``tie`` says whether a difference was shown at ``level``.
 
     Raises:
         ValueError: ``by`` is neither ``"policy"`` nor ``"scaffold"``.
@@ -77,14 +83,15 @@ def differences(
     for (tasks, policy, scaffold), members in _grouped(rows).items():
         varied, held = (policy, scaffold) if by == "policy" else (scaffold, policy)
         found.setdefault((tasks, held), {})[varied] = values_by_task(members, metric)
-    table = []
+    named: list[tuple[dict[str, Any], Estimate]] = []
     for (tasks, held), values in found.items():
         baseline = next(iter(values))
         for name, mine in values.items():
             if name != baseline:
-                estimate = paired_difference(mine, values[baseline], level=level, seed=seed)
-                table.append({"tasks": tasks, fixed: held, by: name, "baseline": baseline, **estimate.to_data()})
-    return table
+                compared = paired(mine, values[baseline], level=level, seed=seed)
+                named.append(({"tasks": tasks, fixed: held, by: name, "baseline": baseline}, compared))
+    estimates = corrected([compared for _, compared in named])
+    return [{**names, **e.to_data(), "tie": e.tie(level)} for (names, _), e in zip(named, estimates, strict=True)]
 
 
 def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
@@ -95,15 +102,16 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
     for tasks in dict.fromkeys(row["tasks"] for row in rows):
         members = [r for r in rows if r["tasks"] == tasks]
         cells = summarise(members, level=level)
-        primary = primary_metric(list(members))
-        heading, digits = BY_NAME[primary].heading, BY_NAME[primary].digits
-        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} bootstrap interval.", ""]
+        metric = primary_metric(members)
+        primary, heading, digits = metric.name, metric.heading, metric.digits
+        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} t interval.", ""]
         parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
         for by in ("policy", "scaffold"):
             compared = differences(members, primary, by=by, level=level)
             if compared:
-                parts += [f"Paired differences in {heading}, by {by}:", "", *_differences(compared, by, digits), ""]
+                parts += [f"Paired differences in {heading}, by {by} ({DIFFERENCES}):", ""]
+                parts += [*_differences(compared, by, digits), ""]
     return "\n".join(parts)
 
 
@@ -122,7 +130,11 @@ def write_report(rows: Sequence[Row], folder: str | Path, *, level: float = 0.95
     """Write ``results.md`` and ``summary.json`` beside ``results.jsonl``."""
     folder = Path(folder)
     write_atomic(folder / "results.md", markdown(rows, level=level))
-    data = {"level": level, "cells": [c.to_data() for c in summarise(rows, level=level)]}
+    metrics = [
+        {"name": m.name, "unit": m.unit, "heading": m.heading, "higher_is_better": m.higher_is_better}
+        for m in columns(rows)
+    ]
+    data = {"level": level, "metrics": metrics, "cells": [c.to_data() for c in summarise(rows, level=level)]}
     write_atomic(folder / "summary.json", json.dumps(data, indent=2, sort_keys=True) + "\n")
 
 
@@ -153,8 +165,15 @@ def _matrix(cells: Sequence[CellSummary], metric: str, digits: int) -> list[str]
     return table(["policy", *scaffolds], body)
 
 
+def metrics_of(cells: Sequence[CellSummary]) -> list[Metric]:
+    """The metrics of any of the cells, in the order of tables."""
+    found = {metric.name: metric for cell in cells for metric in cell.metrics}
+    order = max((cell.metrics for cell in cells), key=len, default=())
+    return [*order, *(metric for metric in found.values() if metric not in order)]
+
+
 def _details(cells: Sequence[CellSummary]) -> list[str]:
-    metrics = [m for m in METRICS if any(m.name in c.estimates for c in cells)]
+    metrics = metrics_of(cells)
     header = ["policy", "scaffold", "episodes", "failed", "cut short", *(m.heading for m in metrics)]
     body = []
     for c in cells:
@@ -170,8 +189,10 @@ def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
     for row in rows:
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), str(row["n"])])
-    return table([fixed, "difference", "mean", "tasks"], body)
+        p = "–" if row["p"] is None else f"{row['p']:.3f}"
+        verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
+        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, str(row["n"])])
+    return table([fixed, "difference", "mean", "p", "verdict", "tasks"], body)
 
 
 def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

@@ -2,8 +2,8 @@
 
     accelerate launch recipes/grpo_delivery.py --config recipes/configs/quickstart_cpu.yaml
 
-Without arguments the CPU quick-start runs. Every field of the config can be given on the command line; ``--resume``
-continues from the last checkpoint. On a GPU machine only the config changes (``qwen3_4b_paper.yaml``).
+Without arguments the CPU quick-start runs. Every field of the config can be given on the command line; `--resume`
+continues from the last checkpoint. On a GPU machine only the config changes (`qwen3_4b_paper.yaml`).
 """
 
 from __future__ import annotations

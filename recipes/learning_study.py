@@ -11,13 +11,17 @@ All configs must name the same model, warm start and world: then one starting po
 from __future__ import annotations
 
 import argparse
+import math
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recipes.common import run_recipe
+
+if TYPE_CHECKING:
+    from eval.statistics import Estimate
 
 START = "start"
 
@@ -117,37 +121,45 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
         seeds: method -> training seeds.
         own: method -> label of the scaffold it was trained in.
     """
-    from eval.metrics import BY_NAME, primary_metric
+    from agentspec.metrics import primary_metric
+    from eval.statistics import compare_runs, corrected
     from eval.tables import table, values_by_task
 
-    metric = primary_metric(list(rows))
-    digits = BY_NAME[metric].digits
+    primary = primary_metric(rows)
+    metric, digits = primary.name, primary.digits
     scaffolds = list(dict.fromkeys(row["scaffold"] for row in rows))
     cells = {
         (policy, s): values_by_task([r for r in rows if (r["policy"], r["scaffold"]) == (policy, s)], metric)
         for policy in dict.fromkeys(row["policy"] for row in rows)
         for s in scaffolds
     }
-    body = []
+    compared: list[tuple[str, str, Mapping[str, float], list[Mapping[str, float]]]] = []
     for method, numbers in seeds.items():
         for scaffold in scaffolds:
             before, *after = (cells[p, scaffold] for p in (START, *(f"{method}-s{n}" for n in numbers)))
             where = f"{scaffold} (its own)" if scaffold == own[method] else scaffold
-            body.append([method, where, *_compared(before, after, digits)])
+            compared.append((method, where, before, after))
+    gains_over_runs = corrected([compare_runs(after, [before]) for _, _, before, after in compared])
+    body = [
+        [method, where, *_compared(before, after, gain, digits)]
+        for (method, where, before, after), gain in zip(compared, gains_over_runs, strict=True)
+    ]
     header = [
         "trained with",
         "evaluated in",
         "before",
         "after (all seeds)",
         "gain (all seeds)",
+        "p",
+        "verdict",
         "gain per seed",
         "tasks",
     ]
     lines = [
-        f"# {BY_NAME[metric].heading} before and after training",
+        f"# {primary.heading} before and after training",
         "",
-        "Greedy, on held-out tasks, paired by task. Intervals: 95 % bootstrap; per seed over tasks, for all seeds over",
-        "training seeds and tasks together. An interval that contains 0 is a tie.",
+        "Greedy, on held-out tasks, paired by task. 95 % t intervals: per seed over tasks (that checkpoint only),",
+        "for all seeds over training runs. p-values of the gains over runs, Holm over the table; above 0.05 is a tie.",
         "",
         *table(header, body),
         "",
@@ -155,17 +167,21 @@ def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]],
     return "\n".join(lines)
 
 
-def _compared(before: Mapping[str, float], after: Sequence[Mapping[str, float]], digits: int) -> list[str]:
-    """Cells of one row, from values by task of the start and of each run; a task that any of them lacks is left out."""
-    from eval.statistics import bootstrap, crossed_bootstrap
+def _compared(
+    before: Mapping[str, float], after: Sequence[Mapping[str, float]], gain: Estimate, digits: int
+) -> list[str]:
+    """Cells of one row, from values by task of the start and of each run; a task that one of them lacks is out."""
+    from eval.statistics import mean_interval, runs_mean
     from eval.tables import show
 
     tasks = [t for t in before if all(t in values for values in after)]
     gained = [[values[t] - before[t] for t in tasks] for values in after]
-    start = bootstrap([before[t] for t in tasks])
-    end = crossed_bootstrap([[values[t] for t in tasks] for values in after])
-    each = ", ".join(show(bootstrap(g), digits) for g in gained)
-    return [*(show(e, digits) for e in (start, end, crossed_bootstrap(gained))), each, str(len(tasks))]
+    start = mean_interval([before[t] for t in tasks])
+    end = runs_mean([{t: values[t] for t in tasks} for values in after])
+    each = ", ".join(show(mean_interval(g), digits) for g in gained)
+    verdict = "tie" if gain.tie() else "gain" if gain.mean > 0 else "loss"
+    p = "–" if math.isnan(gain.p) else f"{gain.p:.3f}"
+    return [show(start, digits), show(end, digits), show(gain, digits), p, verdict, each, str(len(tasks))]
 
 
 if __name__ == "__main__":

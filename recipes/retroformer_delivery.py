@@ -2,7 +2,7 @@
 
     python recipes/retroformer_delivery.py --config recipes/configs/retroformer_cpu.yaml
 
-The trained reflector lies in ``output_dir``, the frozen actor in its folder ``actor``. The table at the end says what
+The trained reflector lies in `output_dir`, the frozen actor in its folder `actor`. The table at the end says what
 lessons bring on held-out shifts: each is played, reflected on if it was not good enough, and played again, with the
 reflector as it was before training and as it is after.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
-    """Train the reflector, draw the curve of gains, evaluate: ``evaluation.md`` and ``evaluation.jsonl``."""
+    """Train the reflector, draw the curve of gains, evaluate: `evaluation.md` and `evaluation.jsonl`."""
     from trainers.arguments import parse_config
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import RetroformerTrainer, as_retroformer
@@ -34,8 +35,15 @@ def main() -> None:
     evaluate_run(config, Path(config.output_dir))
 
 
+def _unscored(runner: Any, jobs: Any) -> list[Any]:
+    """The jobs' episodes; their returns are read off the metrics, so nothing scores them."""
+    from trainers.credit import ScoredEpisode
+
+    return [ScoredEpisode(trajectory, None) for trajectory in runner.run(jobs)]
+
+
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
-    """Two trials of every held-out task with either reflector: rows, also in ``folder`` with their table."""
+    """Two trials of every held-out task with either reflector: rows, also in `folder` with their table."""
     from agentspec.episode import Job, Runner
     from agentspec.files import write_atomic
     from trainers.policy import load_actor_and_reflector
@@ -49,7 +57,8 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     for label, run in (("before training", ""), ("after training", folder)):
         model, tokenizer = load_actor_and_reflector(config, run)
         runner = Runner(spec, routed_llm(model, tokenizer), timeout_s=config.env_timeout_s, policy=label)
-        firsts, lasts = play_trials(runner.run, jobs)
+        played = play_trials(partial(_unscored, runner), jobs)
+        firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):
             returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]
             lesson = [c.text for c in last.calls if c.tag.purpose == "reflect"] if has_lesson(last) else []
@@ -68,7 +77,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     A first trial that was good enough has no second one: it counts with its own return, and a gain of 0. Tasks with a
     trial that failed to run are left out.
     """
-    from eval.statistics import bootstrap, paired_difference
+    from eval.statistics import mean_interval, paired
     from eval.tables import show, table
 
     body, gains = [], {}
@@ -76,16 +85,16 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         members = [r for r in rows if r["reflector"] == label]
         played = [r for r in members if r["first_return"] is not None and r["second_return"] is not None]
         gains[label] = {r["task"]: r["second_return"] - r["first_return"] for r in played}
-        returns = [bootstrap([r[key] for r in played]) for key in ("first_return", "second_return")]
+        returns = [mean_interval([r[key] for r in played]) for key in ("first_return", "second_return")]
         lessons = sum(bool(r["lesson"]) for r in played)
-        numbers = [show(e, 2) for e in (*returns, bootstrap(list(gains[label].values())))]
+        numbers = [show(e, 2) for e in (*returns, mean_interval(list(gains[label].values())))]
         body.append([label, str(len(played)), str(lessons), *numbers])
     first, *others = gains
-    difference = [show(paired_difference(gains[label], gains[first]), 2) for label in others]
+    difference = [show(paired(gains[label], gains[first]), 2) for label in others]
     lines = [
         "# What lessons are worth",
         "",
-        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% bootstrap interval.",
+        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% t interval.",
         "",
         *table(["reflector", "tasks", "lessons", "first trial", "second trial", "gain"], body),
         "",

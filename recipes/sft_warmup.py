@@ -2,7 +2,7 @@
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
 
-The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's ``SFTTrainer`` trains on
+The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's `SFTTrainer` trains on
 the tokens the expert chose; prompts and observations are context.
 """
 
@@ -22,7 +22,7 @@ def main() -> None:
 
 
 def train_warmup(config: Any) -> None:
-    """Supervised training as ``config`` says: ``train_tasks`` demonstrations, ``num_train_epochs`` passes."""
+    """Supervised training as `config` says: `train_tasks` demonstrations, `num_train_epochs` passes."""
     from datasets import Dataset
     from trl import SFTConfig
 

@@ -2,7 +2,7 @@
 
     accelerate launch recipes/supo_delivery.py --config recipes/configs/supo_cpu.yaml
 
-The same trainer as ``grpo_delivery.py``; the scaffold's memory replaces the conversation by the policy's own summary,
+The same trainer as `grpo_delivery.py`; the scaffold's memory replaces the conversation by the policy's own summary,
 and the summary's tokens are trained with the rollout's advantage.
 """
 

@@ -13,7 +13,7 @@ from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
-    """Train, draw the reward curve, evaluate, write ``evaluation.md`` and ``evaluation.jsonl``."""
+    """Train, draw the reward curve, evaluate, write `evaluation.md` and `evaluation.jsonl`."""
     from trainers.arguments import parse_config
     from trainers.run import train
 
@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def evaluate_run(config: object, folder: Path) -> None:
-    """Base and trained policy, and the rule-based expert, under every evaluation scaffold of ``config``."""
+    """Base and trained policy, and the rule-based expert, under every evaluation scaffold of `config`."""
     from agentspec.llm.models import resolve_adapter
     from eval.matrix import Policy, evaluate
     from eval.tables import markdown

@@ -56,6 +56,8 @@ REWARDS: dict[str, RewardEntry] = {
     "invalid_action": RewardEntry("rewards.invalid_action:invalid_action", "-1 per step whose action was refused"),
     "delivery": RewardEntry("rewards.delivery:delivery", "shaping: +1 per order picked up, +1 per order delivered"),
     "env": RewardEntry("rewards.env:env_reward", "the environment's own reward"),
+    "success": RewardEntry("rewards.outcome:success", "1 at the last step of an episode that succeeded"),
+    "outcome": RewardEntry("rewards.outcome:outcome", "the environment's primary figure, at the last step"),
     "reflection_gain": RewardEntry(
         "rewards.reflection_gain:reflection_gain", "return less that of the trial whose lesson was followed; else 0"
     ),

@@ -17,7 +17,7 @@ def earning_delta(trajectory: Trajectory) -> tuple[float, ...]:
     if any(t.info.get("balance") is None for t in trajectory.transitions):
         raise ValueError(
             f"earning_delta needs info['balance'] at every step; {trajectory.task.env} does not report it. "
-            "Choose another reward (env, success)"
+            "Choose another reward (env, success, outcome)"
         )
     balances = [float(t.info["balance"]) for t in trajectory.transitions]
     before = [_initial_balance(trajectory), *balances[:-1]][: len(balances)]

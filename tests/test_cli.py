@@ -70,9 +70,9 @@ def test_run_ends_with_the_outcome_as_json(capsys: pytest.CaptureFixture[str]) -
     last = capsys.readouterr().out.splitlines()[-1]
     assert json.loads(last) == {
         "net_earnings": float(sum(prices(3))),  # sells at all five prices
-        "hourly_profit": None,  # a toy knows no hours
+        "deliveries": 0,  # the toy declares these two
+        "return": float(sum(prices(3))),
         "steps": 5,
-        "deliveries": 0,
     }
 
 
@@ -82,6 +82,27 @@ def test_several_episodes_end_with_their_mean(capsys: pytest.CaptureFixture[str]
     assert (first["seed"], second["seed"]) == (0, 1)
     assert mean["net_earnings"] == (sum(prices(0)) + sum(prices(1))) / 2
     assert mean["episodes"] == 2 and mean["failed"] == 0
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "MiniGrid-Empty-5x5-v0", "minigrid:MiniGrid-Empty-5x5-v0"])
+def test_environments_of_gymnasium_run(env: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if "MiniGrid" in env:
+        pytest.importorskip("minigrid")
+    assert main(["run", "--env", env, "--policy", "random", "--episodes", "2", "--json"]) == 0
+    first, second, mean = map(json.loads, capsys.readouterr().out.splitlines())
+    assert first["status"] == second["status"] == "completed" and mean["episodes"] == 2
+    assert mean["steps"] == (first["steps"] + second["steps"]) / 2 and first["steps"] > 5
+    if env == "CartPole-v1":
+        assert first["return"] == first["steps"]  # one point for every step the pole stands
+
+
+def test_an_unknown_environment_names_the_nearest_of_all(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, remedy in (
+        ("CartPol-v1", "did you mean CartPole-v1"),
+        ("no_such_module:X-v0", "there is no module 'no_such_module'"),
+        ("Pendulum-v1", "expected a discrete or text action space"),
+    ):
+        assert remedy in refused(capsys, "run", "--env", name, "--policy", "random")
 
 
 def test_run_prints_a_line_for_people(capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,9 +272,9 @@ def test_list_json_has_every_name_with_profile_and_needs(capsys: pytest.CaptureF
         for entry in entries.values():
             assert set(entry["calls"]) == {"retrieve", "store", "step", "episode"}
             assert isinstance(entry["needs"], list) and entry["summary"]
-    assert found["reasoning"]["cot"]["calls"]["step"] == [1, 2]
+    assert found["reasoning"]["cot"]["calls"]["step"] == [1, 4]
     assert main(["list", "reasoning"]) == 0
-    assert "1-2 calls per step" in capsys.readouterr().out
+    assert "1-4 calls per step" in capsys.readouterr().out
 
 
 def test_view_prints_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,7 +27,8 @@ EXTENDS = "extends"
 
 OURS = {
     "model": "model adapter actor_adapter actor_temperature lora_r lora_alpha lora_targets lora_layers",
-    "agent and world": "agent environment train_tasks memory_carry retries env_timeout_s rollout_concurrency batching",
+    "agent and world": "agent environment train_tasks memory_carry start_memory retries env_timeout_s "
+    "rollout_concurrency batching",
     "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
     "normalize overlong overlong_ends mask_truncated packing tokens_per_forward",
     "evaluation": "eval_tasks eval_specs eval_sampling validation_tasks validation_specs",
@@ -59,7 +60,7 @@ def parse_config(argv: Sequence[str] | None = None, *, default: str | Path) -> S
         (config,) = parser.parse_args_into_dataclasses(args=rest)
     except ValueError as error:
         raise SpecError(f"{known.config}: {error}") from error
-    return config  # type: ignore[no-any-return]  # transformers' parser has no types
+    return config
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
@@ -104,8 +105,9 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         if value is None:
             result.pop(key, None)
         elif isinstance(value, Mapping):
-            same = isinstance(under, Mapping) and value.get("name", under.get("name")) == under.get("name")
-            result[key] = merged(under if same else {}, value)  # type: ignore[arg-type]  # `same` says a mapping
+            below: Mapping[str, Any] = under if isinstance(under, Mapping) else {}
+            another = value.get("name", below.get("name")) != below.get("name")
+            result[key] = merged({} if another else below, value)
         else:
             result[key] = value
     return result
@@ -116,7 +118,7 @@ class _Parser(argparse.ArgumentParser):
         raise SpecError(f"{message}; a configuration is given as `--config FILE`")
 
 
-class _ConfigParser(TrlParser):  # type: ignore[misc]  # TRL's parser has no types
+class _ConfigParser(TrlParser):
     """TRL's parser; wrong input is one line, no option may be abbreviated, and help begins with what is ours."""
 
     def __init__(self, config: type, *, source: str, description: str) -> None:
@@ -131,7 +133,10 @@ class _ConfigParser(TrlParser):  # type: ignore[misc]  # TRL's parser has no typ
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, [])
         formatter.add_text(self.description)
-        for heading, names in {**OURS, **{f"TRL: {h}": n for h, n in USED.items()}}.items():
+        listed = " ".join((*OURS.values(), *USED.values())).split()
+        more = [n for n in ScaffoldConfig.__annotations__ if n not in listed]  # of ours, without a heading
+        ours = {**OURS, "this run": " ".join((OURS["this run"], *more))}
+        for heading, names in {**ours, **{f"TRL: {h}": n for h, n in USED.items()}}.items():
             formatter.start_section(heading)
             formatter.add_arguments(a for name in names.split() for a in self._actions if a.dest == name)
             formatter.end_section()

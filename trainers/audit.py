@@ -9,8 +9,8 @@ compared field by field, so that
 - masks cover model tokens only, and none that a constraint forced;
 - the advantage of every row is what the declared estimator gives for the returns, and those of a group sum to zero
   where the estimator says so;
-- the loss denominator is what the loss divides by (:mod:`trainers.losses`); padding rows train nothing; rollouts that could not be scored
-  have no rows; the settings of the loss are those of the manifest.
+- the loss denominator is what the loss divides by (`trainers.losses`); padding rows train nothing; rollouts that could
+  not be scored have no rows; the settings of the loss are those of the manifest.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def check(config: ScaffoldConfig) -> None:
     Raises:
         SpecError: what was given, why it cannot work, what to do.
     """
-    _ = config.reward_set, config.world, config.other_specs
+    _ = config.reward_set, config.world, config.other_specs, config.starting_memory
     check_fields(config)
     check_reporters(config)
     check_names(config)
@@ -130,6 +130,11 @@ def check_calls(config: ScaffoldConfig) -> None:
         raise SpecError(
             f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
             f"come from {', '.join(sorted(set(paths))) or 'no module (none calls the model)'}"
+        )
+    if "images" in spec.needs():
+        raise SpecError(
+            "agent.perception has images: true, and the policy that is trained reads text only (pictures have no token "
+            "ids here); train without images, and evaluate models that see"
         )
     if config.actor_temperature < 0:
         raise SpecError(f"actor_temperature is {config.actor_temperature}; expected 0 (greedy) or above")
@@ -264,6 +269,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
         )
     if spec.reflection.params.get("temperature") == 0:
         raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
+    if config.start_memory:
+        raise SpecError("start_memory: lessons are about first trials, which start from nothing; leave it out")
     if config.train_calls != [PATH]:
         raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
     if REWARD not in config.reward_set.weights:

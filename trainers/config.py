@@ -13,6 +13,7 @@ from typing import Any
 
 from trl import GRPOConfig
 
+from agentspec.carry import start_bank
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
@@ -47,15 +48,17 @@ class ScaffoldConfig(GRPOConfig):
         estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
-        skip_zero_variance: leave groups whose returns are all equal out of the loss denominator too.
+        skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
         normalize: ``token`` weighs every trained token alike (an episode that trains more tokens counts more);
             ``rollout`` weighs every rollout alike, so that call-heavy scaffolds do not inflate the loss.
         overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
             the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
         mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
-        memory_carry: with ``scope: run``, whose memory the next generation round starts from: the ``first`` rollout's
-            or the ``best`` one's. All rollouts of a round start from the same memory.
+        memory_carry: with ``scope: run``, whose memory a task carries on: that of its ``first`` rollout in a round, or
+            of its ``best``. All rollouts of a task start from the same memory; tasks share none.
+        start_memory: with ``scope: run``, a memory file or the folder of a run that wrote one (`memory.json`), to start
+            from; empty: every task starts with an empty memory.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
@@ -105,6 +108,7 @@ class ScaffoldConfig(GRPOConfig):
     overlong_ends: list[str] = field(default_factory=lambda: ["context"])
     mask_truncated: list[str] = field(default_factory=list)
     memory_carry: str = field(default="first", metadata={"help": "first or best"})
+    start_memory: str = field(default="", metadata={"help": "memory file or run folder to start from"})
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
@@ -191,6 +195,15 @@ class ScaffoldConfig(GRPOConfig):
         if isinstance(self.rewards, str):
             return RewardSet({self.rewards: 1.0})
         return RewardSet(self.rewards)
+
+    @property
+    def starting_memory(self) -> bytes | None:
+        """The bank of memories that the run starts from (`agentspec.carry`), or ``None`` where it starts from nothing.
+
+        Raises:
+            SpecError: no such file, or one of other modules than the agent's.
+        """
+        return start_bank(self.start_memory, self.spec).dump() if self.start_memory else None
 
     def check(self) -> None:
         """Refuse what cannot work, would not be exact, or would change nothing (`trainers.checks`).

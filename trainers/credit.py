@@ -18,7 +18,7 @@ from typing import Any
 
 from agentspec.trajectory import Trajectory
 from rewards import RewardSet, Score
-from trainers.estimators import ESTIMATORS, estimator
+from trainers.estimators import estimator
 from trainers.sequences import Advantage, Row, TokenSequence, TrainFilter, build_sequences
 
 Gather = Callable[[list[Any]], list[Any]]
@@ -67,7 +67,7 @@ class CreditRule:
 
     Args:
         group: rollouts per task; episodes come in whole groups.
-        estimator: a name in :data:`~trainers.estimators.ESTIMATORS`.
+        estimator: a name in `trainers.estimators.ESTIMATORS`.
         gamma: discount per step, for estimators that need it.
         gigpo_weight: weight of GiGPO's step advantage.
         normalize: `token` or `rollout`: whether every trained token weighs alike, or every rollout.
@@ -258,6 +258,3 @@ def _metrics(
         "rollouts/trained_tokens": float(sum(row.sequence.trained for row in rows)),
         "rollouts/multi_row_episodes": sum(n > 1 for n in per_episode.values()) / max(1, episodes),
     }
-
-
-__all__ = ["ESTIMATORS", "FIELDS", "CreditRule", "Credited", "Outcome", "ScoredEpisode", "is_overlong", "per_rollout"]

@@ -18,6 +18,8 @@ from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
 
+from agentspec.carry import FILE as MEMORY_FILE
+from agentspec.carry import MemoryBank, save_bank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
@@ -34,7 +36,7 @@ from trainers.micro_batches import ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
 from trainers.receipts import write_receipt
 from trainers.resume import ExactResume, restore_finished
-from trainers.rollouts import collect, local_llm, rollout_jobs, task_of
+from trainers.rollouts import collect, local_llm, rollout_jobs, starting_states, task_of
 from trainers.round_metrics import episode_metrics, named, round_metrics
 from trainers.run_folder import last_complete_checkpoint
 from trainers.runlog import RunLog
@@ -91,7 +93,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         self._make_llm = make_llm or partial(local_llm, batching=args.batching)
         self._llm: LLM | None = None
         self._round = 0
-        self._memory: bytes | None = None
+        self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
         self._largest_difference: list[torch.Tensor] = []
 
@@ -179,15 +181,18 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         check_trained(self.last_episodes, self.credit_rule.train, gather_object)
 
     def _carried_memory(self) -> bytes | None:
-        """With ``scope: run``: the memory that the next round starts from, the same on every rank."""
+        """With ``scope: run``: the bank of memories that the next round starts from, the same on every rank.
+
+        Each task carries the memory of one of its own rollouts. The main process keeps the bank as ``memory.json``.
+        """
         if self.args.spec.scope != "run":
             return None
-        local = [(e.total, e.trajectory.memory_state) for e in self._played]
-        scored = [(value, state) for value, state in gather_object(local) if value is not None]
-        if not scored:
-            return self._memory
-        state: bytes | None = (scored[0] if self.args.memory_carry == "first" else max(scored, key=lambda s: s[0]))[1]
-        return state
+        bank = MemoryBank.of_spec(self.args.spec) if self._memory is None else MemoryBank.load(self._memory)
+        played = [(e.trajectory.task.key, e.total, e.trajectory.memory_state) for e in self._played]
+        bank = bank.carried(gather_object(played), self.args.memory_carry)
+        if self.accelerator.is_main_process:
+            save_bank(self.run_log.folder / MEMORY_FILE, bank)
+        return bank.dump()
 
     # --- updates -----------------------------------------------------------------------------------------------------
 
@@ -291,12 +296,14 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
             metric_key_prefix: stands before every metric's name.
         """
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
+        tasks = [task_of(row) for row in rows]
+        states = starting_states(tasks, self._memory, unseen=True)
         training = self.model.training
         self.model.eval()
         with self._current_weights():
             metrics = validate(
                 validation_scaffolds(self.args),
-                [Job(task_of(row), 0, self.args.seed, self._memory) for row in rows],
+                [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
                 lambda spec, jobs: self._play(jobs, spec),
                 rank=self.accelerator.process_index,
                 ranks=self.accelerator.num_processes,

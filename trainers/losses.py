@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-
-import torch
+from typing import TYPE_CHECKING
 
 from agentspec.actions import suggest
 from agentspec.registry import SpecError
 
-Objective = Callable[..., torch.Tensor]
+if TYPE_CHECKING:
+    import torch  # only tensors handed in are touched: the audit reads this table without it
+
+Objective = Callable[..., "torch.Tensor"]
 """`(logps, old, advantages, *, low, high)` -> loss per token; (B, T) each, advantages (B, 1) or (B, T)."""
 
 

@@ -1,6 +1,6 @@
 """The policy to train: a base model from the resolver, with a LoRA adapter, new or warm-started; or with two of them.
 
-The adapter under training is always PEFT's ``default`` one, so that saving, resuming and exporting find it where they
+The adapter under training is always PEFT's `default` one, so that saving, resuming and exporting find it where they
 look; a second, frozen one lies in a folder of its own name beside it.
 """
 
@@ -24,9 +24,9 @@ TRAINED, ACTOR = "default", "actor"
 
 
 def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
-    """Model and tokenizer of ``config``.
+    """Model and tokenizer of `config`.
 
-    float32 on a CPU (bfloat16 is slower there), bfloat16 where the config says ``bf16``. With ``lora_r: 0`` all
+    float32 on a CPU (bfloat16 is slower there), bfloat16 where the config says `bf16`. With `lora_r: 0` all
     weights are trained.
 
     Raises:
@@ -57,7 +57,7 @@ def load_actor_and_reflector(config: ScaffoldConfig, run: str | Path = "") -> tu
     """One base with two adapters, and the tokenizer: the actor's, frozen, and the reflector's, active and trainable.
 
     Args:
-        config: ``actor_adapter`` is the actor's (empty: the actor is the base model), ``adapter`` what the reflector
+        config: `actor_adapter` is the actor's (empty: the actor is the base model), `adapter` what the reflector
             starts from (empty: a new LoRA, which says what the base model says).
         run: folder of a training run or of its checkpoint: both adapters come from there.
 
@@ -121,7 +121,7 @@ def _named(policy: Any, path: str) -> nn.Module:
 
 
 def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
-    """Configuration of a new adapter for ``model``.
+    """Configuration of a new adapter for `model`.
 
     Raises:
         SpecError: more layers than the model has.
@@ -143,7 +143,7 @@ def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
 
 
 def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
-    """Names of the modules that carry LoRA; ``all-linear`` is every linear layer except the output projection."""
+    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection."""
     if config.lora_targets != ["all-linear"]:
         return config.lora_targets
     wrapper: Any = model

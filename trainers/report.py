@@ -14,7 +14,7 @@ BARS = "▁▂▃▄▅▆▇█"
 
 
 def sparkline(values: Sequence[float], width: int = 40) -> str:
-    """The last ``width`` values as bars, scaled between their least and greatest.
+    """The last `width` values as bars, scaled between their least and greatest.
 
     >>> sparkline([0, 1, 2, 3.5])
     '▁▃▅█'
@@ -42,7 +42,7 @@ class Bar(ProgressCallback):
 
 
 class TerminalReport(TrainerCallback):
-    """Prints after every logged update; every ``sample_every`` updates also a rollout.
+    """Prints after every logged update; every `sample_every` updates also a rollout.
 
     Args:
         episodes: gives the episodes of the last generation round.

@@ -16,7 +16,7 @@ reflector with a reward model and PPO on stored lessons; here the group is the b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from agentspec.episode import Job
 from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
-from agentspec.spec import AgentSpec, ModuleSpec
+from agentspec.spec import AgentSpec, ModuleSpec, load_yaml
 from agentspec.trajectory import Trajectory
 from trainers.checks import REFLECTION, REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
@@ -51,6 +51,9 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
     Raises:
         SpecError: what is configured says otherwise (`trainers.checks.check_retroformer`).
     """
+    agent = load_yaml(config.agent) if isinstance(config.agent, str) else config.agent
+    if isinstance(agent, Mapping):  # lessons live from trial to trial, and a reflector refuses any other scope
+        config.agent = {**agent, "scope": "run"}
     spec = config.spec
     if spec.reflection.name in ("none", REFLECTION):
         reflection = ModuleSpec(REFLECTION, {"when": "start", **spec.reflection.params})

@@ -15,28 +15,17 @@ from typing import Any
 
 from torch import nn
 
+from agentspec.carry import MemoryBank
 from agentspec.episode import Job, Runner
 from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
+from agentspec.tasks import TEST_SEEDS, make_tasks
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from rewards import RewardSet, Score
 from trainers.credit import ScoredEpisode
 
-TEST_SEEDS = 20_000
-"""Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
-
-
-def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "train", first: int = 0) -> list[Task]:
-    """``count`` tasks of one environment with consecutive seeds.
-
-    Raises:
-        ValueError: training seeds that reach into the held-out range.
-    """
-    base = {"train": 0, "validation": 10_000, "test": TEST_SEEDS}[split] + first
-    if split == "train" and base + count > 10_000:
-        raise ValueError(f"training seeds {base}..{base + count - 1} reach the held-out range; use fewer than 10,000")
-    return [Task(env, base + i, options, split) for i in range(count)]
+__all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "starting_states", "task_of", "task_rows"]
 
 
 def task_rows(tasks: Sequence[Task]) -> list[dict[str, Any]]:
@@ -69,10 +58,29 @@ def rollout_jobs(
         round: number of the generation round; another round samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
-        memory: state that memories with ``scope: run`` start from; all rollouts of a round start alike.
+        memory: the run's `agentspec.carry.MemoryBank` as bytes (with ``scope: run``): all rollouts of a task start
+            from that task's state.
     """
     run_seed = derive_seed(seed, round)
-    return [Job(task_of(row), (first + i) % group, run_seed, memory) for i, row in enumerate(rows)]
+    tasks = [task_of(row) for row in rows]
+    states = starting_states(tasks, memory)
+    return [
+        Job(t, (first + i) % group, run_seed, state) for i, (t, state) in enumerate(zip(tasks, states, strict=True))
+    ]
+
+
+def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool = False) -> list[bytes | None]:
+    """What an episode of each task starts from, out of a run's memory.
+
+    Args:
+        tasks: in order.
+        memory: a `MemoryBank` as bytes; ``None``: nothing is carried.
+        unseen: tasks that the run does not train on: without a state of their own they start from the latest.
+    """
+    if memory is None:
+        return [None] * len(tasks)
+    bank = MemoryBank.load(memory)
+    return [(bank.as_start() if unseen else bank).of(task) for task in tasks]
 
 
 def collect(runner: Runner, jobs: Sequence[Job], rewards: RewardSet, *, retries: int = 0) -> list[ScoredEpisode]:

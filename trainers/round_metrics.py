@@ -14,12 +14,10 @@ from typing import Any
 import torch
 from trl.trainer.utils import nanstd
 
+from agentspec.metrics import figures
 from agentspec.trajectory import Trajectory
 from trainers.credit import ScoredEpisode
 from trainers.sequences import TrainFilter, trained_completions
-
-EPISODE = ("steps", "invalid_actions", "llm_calls", "input_tokens", "output_tokens", "deliveries")
-"""Figures of an episode that are logged as `episode/NAME` where it has them."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +85,11 @@ def completion_metrics(everyone: Sequence[Played]) -> dict[str, float]:
 
 
 def episode_metrics(trajectories: Sequence[Trajectory]) -> dict[str, float]:
-    """`episode/NAME`: mean figures of the episodes that did not fail."""
-    metrics = {}
-    for name in EPISODE:
-        values = [float(t.metrics[name]) for t in trajectories if t.scorable and name in t.metrics]
-        if values:
-            metrics[f"episode/{name}"] = sum(values) / len(values)
-    return metrics
+    """`episode/NAME`: mean figures of the episodes that did not fail: what `agentspec.metrics.figures` says of each."""
+    rows = [figures(t) for t in trajectories if t.scorable]
+    names = dict.fromkeys(name for row in rows for name in row)
+    values = {name: [row[name] for row in rows if name in row] for name in names}
+    return {f"episode/{name}": sum(found) / len(found) for name, found in values.items()}
 
 
 def named(reward: str) -> Callable[..., Any]:

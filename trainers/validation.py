@@ -12,21 +12,10 @@ from dataclasses import replace
 from typing import Any
 
 from agentspec.episode import Job
+from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
-
-METRICS = (
-    "net_earnings",
-    "success",
-    "deliveries",
-    "steps",
-    "invalid_actions",
-    "llm_calls",
-    "input_tokens",
-    "output_tokens",
-)
-"""Figures of an episode that are logged where the environment or the scaffold reports them."""
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
@@ -55,18 +44,17 @@ def validate(
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
-        ``PREFIXreward`` (the training reward per episode), those of :data:`METRICS` that episodes report, and
-        ``PREFIXunscorable``, the share of episodes that failed; means leave these out. ``reward`` is NaN if all failed.
+        ``PREFIXreward`` (the training reward per episode), the figures that the environment declares and the scaffold's
+        (`agentspec.metrics.figures`), and ``PREFIXunscorable``, the share of episodes that failed; means leave these
+        out. ``reward`` is NaN if all failed.
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
         rows = gather([_figures(episode) for episode in play(spec, jobs[rank::ranks])])
         scored = [row for row in rows if row is not None]
         metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
-        for name in METRICS:
-            values = [row[name] for row in scored if name in row]
-            if values:
-                metrics[f"{prefix}{name}"] = _mean(values)
+        for name in dict.fromkeys(name for row in scored for name in row if name != "reward"):
+            metrics[f"{prefix}{name}"] = _mean([row[name] for row in scored if name in row])
         metrics[f"{prefix}unscorable"] = 1 - len(scored) / len(rows)
     return metrics
 
@@ -75,8 +63,7 @@ def _figures(episode: ScoredEpisode) -> dict[str, float] | None:
     """Numbers of one episode; `None` if it failed."""
     if episode.score is None:
         return None
-    metrics = episode.trajectory.metrics
-    return {"reward": episode.score.total} | {n: float(metrics[n]) for n in METRICS if n in metrics}
+    return figures(episode.trajectory) | {"reward": episode.score.total}
 
 
 def _mean(values: Sequence[float]) -> float:

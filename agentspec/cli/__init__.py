@@ -1,4 +1,4 @@
-"""The command line: ``agentspec run | eval | export | audit | list | view``.
+"""The command line: `agentspec run | eval | export | audit | list | view`.
 
 Thin: every command parses its arguments, calls the library and prints. Input that cannot work is one line on stderr
 that names the remedy, and exit code 2; an episode that failed while running is exit code 1; anything unexpected keeps
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; default: those of the process.
 
     Returns:
-        The exit code. Errors of the input end the process with code 2 instead (``SystemExit``).
+        The exit code. Errors of the input end the process with code 2 instead (`SystemExit`).
     """
     from agentspec.cli.ours import claim_packages
     from agentspec.cli.parser import build_parser
@@ -41,5 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
             return 0
         except KeyboardInterrupt:
-            sys.stderr.write("agentspec: stopped\n")
+            again = "; the same command goes on where it stopped" if hasattr(arguments, "out_resumes") else ""
+            sys.stderr.write(f"agentspec: stopped{again}\n")
             return 130

@@ -1,4 +1,4 @@
-"""``python -m agentspec.cli``."""
+"""`python -m agentspec.cli`."""
 
 import sys
 

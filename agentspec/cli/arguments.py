@@ -13,7 +13,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 
 if TYPE_CHECKING:
-    from eval.policies import Policy
+    from agentspec.policies import Policy
 
 LABEL_CHARACTERS = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+.() ")
 
@@ -118,7 +118,7 @@ def parse_seeds(texts: Sequence[str]) -> list[int]:
 
 def parse_policy(text: str, arguments: argparse.Namespace) -> Policy:
     """A policy, with the settings of ``--llm`` if it is a model."""
-    from eval.policies import Policy
+    from agentspec.policies import Policy
 
     policy = Policy.parse(text)
     if policy.scripted:

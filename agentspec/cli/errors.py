@@ -21,7 +21,7 @@ DISTRIBUTION = "agentspec-rl"
 """Its name for pip: `agentspec` is another project there."""
 
 OURS = ("agentspec", "trainers", "rewards", "eval", "recipes")
-"""Packages whose ``ValueError`` is a check of the input; one that numpy or torch raises keeps its traceback."""
+"""Packages whose `ValueError` is a check of the input; one that numpy or torch raises keeps its traceback."""
 
 EXPECTED = (SpecError, LLMError, yaml.YAMLError, FileNotFoundError, FileExistsError, NotADirectoryError)
 EXPECTED_OS = (IsADirectoryError, PermissionError)
@@ -45,14 +45,14 @@ EXTRAS = {
 
 
 def fail(error: BaseException | str) -> NoReturn:
-    """Print ``agentspec: error: ...`` as one line on stderr and exit with code 2."""
+    """Print `agentspec: error: ...` as one line on stderr and exit with code 2."""
     sys.stderr.write(f"{PROGRAM}: error: {one_line(error)}\n")
     raise SystemExit(2) from (error if isinstance(error, BaseException) else None)
 
 
 @contextmanager
 def expected_errors(*more: type[BaseException]) -> Iterator[None]:
-    """Turn expected errors inside the block into :func:`fail`.
+    """Turn expected errors inside the block into `fail`.
 
     Args:
         more: exception types to expect on top of the usual ones (say, those of another library's argument parser).
@@ -66,7 +66,7 @@ def expected_errors(*more: type[BaseException]) -> Iterator[None]:
 
 
 def is_expected(error: BaseException) -> bool:
-    """Whether an error speaks about the input: ours by type, or a ``ValueError`` that our own code raised."""
+    """Whether an error speaks about the input: ours by type, or a `ValueError` that our own code raised."""
     if isinstance(error, ModuleNotFoundError):
         return _package(error) in EXTRAS
     if isinstance(error, (*EXPECTED, *EXPECTED_OS)):

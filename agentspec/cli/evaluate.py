@@ -29,7 +29,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "eval",
         help="measure policies under scaffolds",
-        description="Play every policy under every scaffold on the same tasks; means with bootstrap intervals.",
+        description="Play every policy under every scaffold on the same tasks: intervals, paired tests.",
     )
     parser.add_argument(
         "--policies",
@@ -55,6 +55,13 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--seed", type=int, default=0, help="seed of the agents' own draws")
     group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
     group.add_argument(
+        "--start-memory",
+        nargs="+",
+        default=[],
+        metavar="[POLICY=]FILE|DIR",
+        help="memory that a run left, for scaffolds with scope: run; for all policies, or for those named",
+    )
+    group.add_argument(
         "--sampling", action="append", default=[], metavar="KEY=VALUE", help="sampling (default: temperature=0)"
     )
     group = parser.add_argument_group("output")
@@ -66,7 +73,7 @@ def add_parser(commands: Any) -> None:
     )
     group.add_argument("--plot", action="store_true", help="write matrix.png")
     group.add_argument("--json", action="store_true", help="print the summary as JSON instead of tables")
-    parser.set_defaults(command=run)
+    parser.set_defaults(command=run, out_resumes=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -83,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         max_steps=arguments.max_steps,
         prices=load_prices(arguments.prices),
         trajectories=arguments.trajectories,
+        start_memory=start_memory(arguments.start_memory),
         retry_failed=arguments.retry_failed,
         replace_stale=arguments.replace_stale,
     )
@@ -100,6 +108,20 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(markdown(rows))
     return 0 if any(row["status"] == "completed" for row in rows) else 1
+
+
+def start_memory(texts: Sequence[str]) -> str | dict[str, str]:
+    """One memory for all policies, or one each for those named.
+
+    Raises:
+        SpecError: several without a policy's name.
+    """
+    pairs = [text.partition("=") for text in texts]
+    if len(texts) == 1 and (not pairs[0][1] or Path(texts[0]).exists()):
+        return texts[0]
+    if not all(equals for _, equals, _ in pairs):
+        raise SpecError(f"--start-memory {' '.join(texts)}: with several, expected POLICY=FILE for each")
+    return {policy: source for policy, _, source in pairs}
 
 
 def scaffolds(texts: Sequence[str]) -> dict[str, AgentSpec]:

@@ -1,4 +1,4 @@
-"""``agentspec export``: a trained run as a folder that stands on its own."""
+"""`agentspec export`: a trained run as a folder that stands on its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Arguments of ``agentspec export``."""
+    """Arguments of `agentspec export`."""
     parser = commands.add_parser(
         "export",
         help="write the trained adapter or merged weights",

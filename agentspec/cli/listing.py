@@ -1,4 +1,4 @@
-"""``agentspec list``: everything that can stand in a spec, with what it costs and needs."""
+"""`agentspec list`: everything that can stand in a spec, with what it costs and needs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KINDS = ("env", "perception", "memory", "reasoning", "reflection", "reward")
 
 
 def add_parser(commands: Any) -> None:
-    """Arguments of ``agentspec list``."""
+    """Arguments of `agentspec list`."""
     parser = commands.add_parser(
         "list", help="list environments, modules and rewards", description="All registered names, by kind."
     )
@@ -54,7 +54,7 @@ def registered() -> dict[str, dict[str, Any]]:
 
 
 def _calls(profile: dict[str, Any]) -> str:
-    """``1-2 calls per step``; empty for methods that call no model."""
+    """`1-2 calls per step`; empty for methods that call no model."""
     parts = []
     for occasion, (fewest, most) in profile.items():
         if most:

@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agentspec.cli.arguments import (
@@ -24,7 +25,10 @@ from agentspec.trajectory import Trajectory, write_trajectories
 from agentspec.types import Task, Transition
 
 if TYPE_CHECKING:
-    from eval.policies import Policy
+    from agentspec.policies import Policy
+
+UNTOLD = ("input_tokens_per_step", "output_tokens_per_step", "calls_per_step", "cost")
+"""Figures that the line about a finished episode leaves out."""
 
 
 def add_parser(commands: Any) -> None:
@@ -49,8 +53,15 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--seed", type=int, default=0, help="seed of the first episode's task (default: %(default)s)")
     group.add_argument("--episodes", type=int, default=1, metavar="N", help="tasks with consecutive seeds")
     group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group.add_argument(
+        "--start-memory", default="", metavar="FILE|DIR", help="start from a memory that a run left (scope: run)"
+    )
     group = parser.add_argument_group("output")
-    group.add_argument("--out", metavar="FILE", help="write the trajectories, one JSON line each")
+    group.add_argument(
+        "--out",
+        metavar="FILE",
+        help="write the trajectories, one JSON line each; with `scope: run` the memory beside it",
+    )
     group.add_argument("--gif", metavar="FILE", help="write an animation of the first episode")
     group.add_argument("--json", action="store_true", help="print JSON; the last line has the (mean) outcome")
     parser.set_defaults(command=run)
@@ -58,6 +69,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Play, print, write; exit code 1 if an episode failed."""
+    from agentspec.carry import run_in_order, save_bank, start_bank
     from agentspec.cli.frames import Film
     from agentspec.episode import Job, Runner, environment_id, make_env
 
@@ -71,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     tasks = [Task(arguments.env, arguments.seed + i, options, "test") for i in range(arguments.episodes)]
     # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
     make_env(tasks[0]).close()
+    start = start_bank(arguments.start_memory, spec)
     film = Film(arguments.gif, tasks[0]) if arguments.gif else None
     plays_model = policy is not None and not policy.scripted
     if policy and plays_model and policy.settings()["backend"] == "local":
@@ -79,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         spec,
         policy.build() if policy else None,
         make_env=film.make_env if film else make_env,
-        concurrency=1 if spec.scope == "run" else arguments.concurrency,
+        concurrency=arguments.concurrency,
         timeout_s=arguments.timeout,
         max_steps=arguments.max_steps,
         prices=load_prices(arguments.prices),
@@ -88,7 +101,13 @@ def run(arguments: argparse.Namespace) -> int:
         on_step=_print_step if plays_model else None,
         progress=episode_progress,
     )
-    trajectories = runner.run([Job(task) for task in tasks])
+    jobs = [Job(task) for task in tasks]
+    if spec.scope == "run":
+        trajectories, bank = run_in_order(runner, jobs, start)
+        if arguments.out:
+            save_bank(Path(arguments.out).with_suffix(".memory.json"), bank)
+    else:
+        trajectories = runner.run(jobs)
     if arguments.out:
         write_trajectories(arguments.out, trajectories)
     failed = [t for t in trajectories if not t.scorable]
@@ -107,7 +126,7 @@ def agent(arguments: argparse.Namespace) -> tuple[Policy | None, AgentSpec]:
     Raises:
         SpecError: the spec calls a model and none was named.
     """
-    from eval.policies import needs_model
+    from agentspec.policies import needs_model
 
     spec = AgentSpec.from_yaml(arguments.spec) if arguments.spec else AgentSpec()
     if arguments.sampling:
@@ -138,19 +157,18 @@ def _print_step(task: Task, transition: Transition) -> None:
 
 def _print_outcome(trajectory: Trajectory) -> None:
     """One line about a finished episode."""
-    from eval.metrics import BY_NAME, episode_row
+    from agentspec.metrics import columns, episode_row
 
     row = episode_row(trajectory)
     if not trajectory.scorable:
         return
-    names = ("net_earnings", "hourly_profit", "success", "deliveries", "steps", "invalid_share", "thinking_s_per_step")
-    parts = [f"{BY_NAME[n].heading} {row[n]:.{BY_NAME[n].digits}f}" for n in names if row.get(n) is not None]
+    parts = [f"{m.heading} {m.show(row[m.name])}" for m in columns([row]) if m.name not in UNTOLD]
     print(f"seed {trajectory.task.seed}: {', '.join(parts)} (ended by {row['ended']})", flush=True)
 
 
 def _print_json(trajectories: Sequence[Trajectory]) -> None:
     """With several episodes a line for each; the last line is the outcome, or the mean over unfailed episodes."""
-    from eval.metrics import outcome
+    from agentspec.metrics import outcome
 
     outcomes = [outcome(t) for t in trajectories]
     if len(outcomes) == 1:

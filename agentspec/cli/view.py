@@ -1,4 +1,4 @@
-"""``agentspec view``: a recorded episode, readable."""
+"""`agentspec view`: a recorded episode, readable."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WIDTH = 116
 
 
 def add_parser(commands: Any) -> None:
-    """Arguments of ``agentspec view``."""
+    """Arguments of `agentspec view`."""
     parser = commands.add_parser("view", help="print a recorded episode", description="Print a recorded episode.")
     parser.add_argument("file", metavar="TRAJ.jsonl", help="trajectories, one JSON line each")
     parser.add_argument("--episode", type=int, default=0, metavar="N", help="which of them, from 0")

@@ -3,8 +3,8 @@
 An environment is a `gymnasium.Env` that speaks text:
 
 - `observation` is a mapping with `text`: the dynamic part of the prompt. It may hold `image`, `uint8` (H, W, 3).
-- `step(action)` takes any text. A text that is no action, or an action that cannot be done now, is a step like any other:
-  nothing raises, `info["invalid"]` is set and `info["error"]` says what to write instead.
+- `step(action)` takes any text. A text that is no action, or an action that cannot be done now, is a step like any
+  other: nothing raises, `info["invalid"]` is set and `info["error"]` says what to write instead.
 - `info` holds the keys of `INFO_KEYS`, from `reset` on.
 - `reset(seed=s)` and the same texts give the same episode, whatever was played before. After the end, `step` changes
   nothing.
@@ -101,7 +101,7 @@ def check_environment(env: Any, *, seed: int = 0, steps: int = 30) -> None:
 
 def _problems(env: Any, seed: int, steps: int) -> Iterator[str]:
     """Everything that is wrong; an exception of the environment is a problem and ends that check only."""
-    for check in (_declares, _shows, _refuses, _offers, _repeats, _copies, _snapshots, _ends):
+    for check in (_declares, _shows, _refuses, _offers, _repeats, _copies, _snapshots, _deliberates, _ends):
         problems: list[str] = []
         try:
             for problem in check(env, seed, steps):
@@ -182,7 +182,7 @@ def _refuses(env: Any, seed: int, steps: int) -> Iterator[str]:
     for text in NONSENSE:
         _, _, terminated, truncated, info = env.step(text)
         if not info.get("invalid") or not info.get("error"):
-            yield f"the text {text!r} is no action; expected info['invalid'] and an info['error'] that says what to write"
+            yield f"the text {text!r} is no action; expected info['invalid'] and an info['error'] with what to write"
         if terminated or truncated:
             return
 
@@ -258,6 +258,18 @@ def _snapshots(env: Any, seed: int, steps: int) -> Iterator[str]:
     yield from _differences(mine, again, "restored from a snapshot")
 
 
+def _deliberates(env: Any, seed: int, steps: int) -> Iterator[str]:
+    """Where thinking is charged, the charge of each step stands in its report."""
+    deliberate = getattr(getattr(env, "unwrapped", env), "deliberate", None)
+    if not callable(deliberate):
+        return
+    info = env.reset(seed=seed)[1]
+    deliberate(2, 10)
+    told = list(env.step(_some_action(info, random.Random(seed)))[4].get("thought") or ())
+    if told != [2, 10]:
+        yield f"after deliberate(2, 10) the step reports info['thought'] {told}; expected [2, 10]"
+
+
 def _ends(env: Any, seed: int, steps: int) -> Iterator[str]:
     """What is declared is reported, and a step after the end changes nothing."""
     reports = _play(env, seed, steps, random.Random(seed))
@@ -328,7 +340,8 @@ def _differences(mine: list[_Report], theirs: list[_Report], what: str) -> Itera
         different = [name for name, (left, right) in pairs.items() if left != right]
         if different:
             name = different[0]
-            yield f"{what}, step {number} differs in {', '.join(different)}: {pairs[name][0]!r} became {pairs[name][1]!r}"
+            before, after = pairs[name]
+            yield f"{what}, step {number} differs in {', '.join(different)}: {before!r} became {after!r}"
             return
 
 

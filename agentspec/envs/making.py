@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -20,14 +21,20 @@ PROVIDERS = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniwor
 """First part of an id -> the module that registers such ids when it is imported."""
 
 
+def short_names() -> Mapping[str, str]:
+    """Registered short name -> gymnasium id."""
+    return {name: entry.target for name, entry in REGISTRY.all("env").items()}
+
+
 def environment_id(name: str) -> str:
     """The gymnasium id of a registered short name; ids pass through, `module:Id-v0` imports the module first.
 
     Raises:
         SpecError: unknown, with the nearest names, or a module that is not there.
     """
-    if name in REGISTRY.entries.get("env", {}):
-        return REGISTRY.get("env", name).target
+    ours = short_names()
+    if name in ours:
+        return ours[name]
     module, _, plain = name.rpartition(":")
     if plain not in gymnasium.registry:
         module = module or PROVIDERS.get(re.split(r"[-/]", plain)[0], "")
@@ -58,14 +65,18 @@ def make_env(task: Task) -> Any:
 
 
 def environment_class(name: str) -> Any:
-    """The class (or function) that makes an environment, or `None` if there is none of this name or it cannot load."""
+    """The class (or function) that makes an environment, or `None` if there is none of this name or it cannot load.
+
+    Names may come from recorded rows: unlike `environment_id`, this imports no module that a name asks for.
+    """
+    plain = short_names().get(name) or name.rpartition(":")[2]
     try:
-        entry_point = gymnasium.registry[environment_id(name)].entry_point
+        entry_point = gymnasium.registry[plain].entry_point
         if not isinstance(entry_point, str):
             return entry_point
         module, _, attribute = entry_point.partition(":")
         return getattr(importlib.import_module(module), attribute)
-    except (SpecError, ImportError, AttributeError):
+    except (KeyError, ImportError, AttributeError):
         return None
 
 
@@ -82,6 +93,6 @@ def _import(module: str, name: str) -> None:
 
 def _near(name: str) -> str:
     """A hint: the nearest of our names and of all gymnasium ids; ours alone where none is near."""
-    ours = list(REGISTRY.entries.get("env", {}))
+    ours = list(short_names())
     hint = suggest(name, [*ours, *gymnasium.registry])
     return hint if hint.startswith("; did you mean") else f"{suggest(name, ours)}, any gymnasium id, or module:Id-v0"

@@ -15,6 +15,7 @@ from agentspec.llm.base import LLM, LLMError
 
 _BACKENDS = {
     "local": ("agentspec.llm.local", "LocalLLM.load", "name_or_path", "'agentspec-rl[train]'"),
+    "vision": ("agentspec.llm.vision", "VisionLLM.load", "name_or_path", "'agentspec-rl[train]'"),
     "openai": ("agentspec.llm.openai", "OpenAILLM", "model", "'agentspec-rl[openai]'"),
     "scripted": ("agentspec.llm.scripted", "ScriptedLLM", "script", "agentspec-rl"),
 }
@@ -26,9 +27,9 @@ def build_llm(config: Mapping[str, Any]) -> LLM:
     """The backend that ``config`` describes.
 
     Args:
-        config: ``{"backend": "local" | "openai" | "scripted", "model": ..., ...}``. ``model`` is a folder, bundled
-            name or hub id for ``local``, the server's model name for ``openai``; ``scripted`` takes ``script`` (a
-            list of answers) instead. All other keys are keyword arguments of the backend's class.
+        config: ``{"backend": "local" | "vision" | "openai" | "scripted", "model": ..., ...}``. ``model`` is a folder,
+            bundled name or hub id for ``local`` and ``vision``, the server's model name for ``openai``; ``scripted``
+            takes ``script`` (a list of answers) instead. All other keys are keyword arguments of the backend's class.
 
     Raises:
         ValueError: an unknown backend or key, or a missing one.

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
-from agentspec.types import CallTag, LLMCall, Part, Sampled, Sampling
+from agentspec.types import CallTag, LLMCall, Part, Picture, Sampled, Sampling
 
 __all__ = [
     "LLM",
@@ -21,6 +21,7 @@ __all__ = [
     "LLMError",
     "Message",
     "Part",
+    "Picture",
     "Request",
     "Sampled",
     "assistant",
@@ -28,7 +29,7 @@ __all__ = [
     "user",
 ]
 
-Capability = Literal["token_ids", "logprobs", "choices", "score", "n"]
+Capability = Literal["token_ids", "logprobs", "choices", "score", "n", "images"]
 """What a backend can do beyond plain sampling; a module's ``needs`` are checked against it before a run."""
 
 
@@ -42,15 +43,15 @@ class ContextOverflowError(LLMError):
 
 @dataclass(frozen=True)
 class Message:
-    """One chat turn. ``content`` is a tuple of parts; system and user turns hold plain text only."""
+    """One chat turn: a tuple of parts. System turns hold plain text, user turns text and pictures."""
 
     role: Literal["system", "user", "assistant"]
-    content: tuple[Part, ...]
+    content: tuple[Part | Picture, ...]
 
     @property
     def text(self) -> str:
-        """The turn as plain text."""
-        return "".join(p if isinstance(p, str) else p.text for p in self.content)
+        """The turn as plain text; a picture has none."""
+        return "".join(p if isinstance(p, str) else p.text for p in self.content if not isinstance(p, Picture))
 
 
 def system(text: str) -> Message:
@@ -58,9 +59,9 @@ def system(text: str) -> Message:
     return Message("system", (text,))
 
 
-def user(text: str) -> Message:
-    """A user turn."""
-    return Message("user", (text,))
+def user(text: str, *pictures: Picture) -> Message:
+    """A user turn; pictures stand before the text."""
+    return Message("user", (*pictures, text))
 
 
 def assistant(*parts: Part) -> Message:

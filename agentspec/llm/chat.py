@@ -29,7 +29,8 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
-from agentspec.llm.base import LLMError, Message, Sampled
+from agentspec.llm.base import LLMError, Message, Picture, Sampled
+from agentspec.llm.pictures import refuse_pictures
 
 FALLBACK_TEMPLATE = (
     "{% for message in messages %}"
@@ -83,8 +84,9 @@ class ChatFormat:
         """Token ids of the prompt after which the model writes the next (or the rest of the last) assistant turn.
 
         Raises:
-            LLMError: no message before the assistant's, or the template refuses the conversation.
+            LLMError: no message before the assistant's, a picture among them, or the template refuses the conversation.
         """
+        refuse_pictures(messages, _name(self.tokenizer))
         continued = messages[-1] if messages and messages[-1].role == "assistant" else None
         turns = messages[:-1] if continued else messages
         if not turns:
@@ -124,7 +126,7 @@ class ChatFormat:
         for part in message.content:
             if isinstance(part, Sampled) and part.token_ids:
                 ids.extend(part.token_ids)
-            else:
+            elif not isinstance(part, Picture):
                 ids.extend(self.encode(part.text if isinstance(part, Sampled) else part))
         return ids
 

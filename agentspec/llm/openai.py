@@ -31,8 +31,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from agentspec.llm.base import ContextOverflowError, LLMError, Message, Request
+from agentspec.llm.pictures import LARGEST, data_url, fitted, refuse_pictures
 from agentspec.llm.recorder import derive_seed
-from agentspec.types import Completion, LLMCall, Usage
+from agentspec.types import Completion, LLMCall, Picture, Usage
 
 _DEFAULT_URL = "https://api.openai.com/v1"
 _RETRIED = frozenset({408, 409, 429, 500, 502, 503, 504, 529})
@@ -70,6 +71,9 @@ class OpenAILLM:
         max_concurrency: requests in flight at once.
         first_pause_s: pause before the first retry; it doubles with each.
         max_context: context window in tokens, where the server's is known.
+        images: whether the model sees; `False` refuses pictures before the first episode.
+        max_image_side: pictures are scaled down until their longer side has at most this many pixels.
+        image_detail: the protocol's `detail` of pictures (`low`, `high`, `auto`); empty: not sent.
     """
 
     def __init__(
@@ -89,6 +93,9 @@ class OpenAILLM:
         max_concurrency: int = 16,
         first_pause_s: float = 0.5,
         max_context: int = 128_000,
+        images: bool = True,
+        max_image_side: int = LARGEST,
+        image_detail: str = "",
     ) -> None:
         if server not in ("openai", "vllm"):
             raise ValueError(f"unknown server {server!r}; expected 'openai' or 'vllm'")
@@ -116,8 +123,11 @@ class OpenAILLM:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._client: Any = None
         self._slots = asyncio.Semaphore(max_concurrency)
+        self._largest = max_image_side
+        self._detail = {"detail": image_detail} if image_detail else {}
         own = {"token_ids", "logprobs"} if self._vllm else set()
-        self.capabilities = frozenset({"choices", "n"} | own)
+        sees = {"images"} if images else set()
+        self.capabilities = frozenset({"choices", "n"} | own | sees)
 
     async def generate(self, request: Request) -> LLMCall:
         """Ask the server for ``n`` completions; asks again for the rest where it gives fewer.
@@ -128,6 +138,8 @@ class OpenAILLM:
         """
         began = time.perf_counter()
         sampling = request.sampling
+        if "images" not in self.capabilities:
+            refuse_pictures(request.messages, f"{self.name} (`images: false`)")
         if sampling.top_k and not self._vllm:
             raise LLMError(f"top_k={sampling.top_k} is not part of the OpenAI protocol; set it to 0, or `server: vllm`")
         completions: list[Completion] = []
@@ -175,7 +187,7 @@ class OpenAILLM:
         sampling = request.sampling
         body: dict[str, Any] = {
             "model": self.name,
-            "messages": [{"role": m.role, "content": m.text} for m in request.messages],
+            "messages": [{"role": m.role, "content": self._content(m)} for m in request.messages],
             "temperature": sampling.temperature,
             "top_p": sampling.top_p,
             "n": sampling.n - have,
@@ -218,6 +230,19 @@ class OpenAILLM:
                 )
                 return True
         return False
+
+    def _content(self, message: Message) -> str | list[dict[str, Any]]:
+        """A turn as the protocol writes it: text, or parts where there are pictures."""
+        if not any(isinstance(part, Picture) for part in message.content):
+            return message.text
+        parts: list[dict[str, Any]] = []
+        for part in message.content:
+            if isinstance(part, Picture):
+                url = {"url": data_url(fitted(part, self._largest))}
+                parts.append({"type": "image_url", "image_url": url | self._detail})
+            else:
+                parts.append({"type": "text", "text": part if isinstance(part, str) else part.text})
+        return parts
 
     def _completion(self, choice: Mapping[str, Any], request: Request) -> Completion:
         text = (choice.get("message") or {}).get("content") or ""

@@ -13,7 +13,8 @@ from typing import ClassVar
 
 from agentspec.llm.base import LLMError, Message, Request, Sampled, require_context
 from agentspec.llm.constrain import ChoiceTrie
-from agentspec.types import Completion, LLMCall, Usage
+from agentspec.llm.pictures import refuse_pictures
+from agentspec.types import Completion, LLMCall, Picture, Usage
 
 Script = Sequence[str | Sequence[str]] | Callable[[Request], str | Sequence[str]]
 
@@ -43,6 +44,8 @@ class ByteTokenizer:
         for i, message in enumerate(messages):
             ids.append(self.ROLES[message.role])
             for part in message.content:
+                if isinstance(part, Picture):
+                    continue  # a scripted model that sees is shown the request, not its bytes
                 if isinstance(part, Sampled):
                     ids.extend(part.token_ids or self.encode(part.text))
                 else:
@@ -65,9 +68,8 @@ class ScriptedLLM:
         score: ``(messages, continuation) -> log-probability``; by default minus the number of bytes.
         name: model name in the records.
         max_context: context window in byte tokens.
+        images: whether it takes pictures.
     """
-
-    capabilities = frozenset({"token_ids", "logprobs", "choices", "score", "n"})
 
     def __init__(
         self,
@@ -76,12 +78,15 @@ class ScriptedLLM:
         score: Callable[[Sequence[Message], str], float] | None = None,
         name: str = "scripted",
         max_context: int = 1_000_000,
+        images: bool = False,
     ) -> None:
         if not callable(script) and (isinstance(script, str) or not script):
             raise ValueError(f"a script is a function or a non-empty list of answers, got {script!r}")
         self.name = name
         self.max_context = max_context
         self.tokenizer = ByteTokenizer()
+        sees = {"images"} if images else set()
+        self.capabilities = frozenset({"token_ids", "logprobs", "choices", "score", "n"} | sees)
         self._script = script
         self._score = score
 
@@ -92,6 +97,8 @@ class ScriptedLLM:
             LLMError: the answer is not one of ``choices``, or there are not ``n`` of them.
             ContextOverflowError: prompt plus ``max_tokens`` exceed ``max_context``.
         """
+        if "images" not in self.capabilities:
+            refuse_pictures(request.messages, self.name)
         sampling = request.sampling
         prompt = self.tokenizer.render(request.messages)
         if sampling.choices:

@@ -9,4 +9,7 @@ from agentspec.perception.generic import GenericPerception
 class DeliveryBenchPerception(GenericPerception):
     """Image, Instruction, State Info and Action Schema of a DeliveryBench observation (see `GenericPerception`)."""
 
-    declaration = Declaration("the four components of DeliveryBench: image, instruction, state, action schema")
+    declaration = Declaration(
+        "the four components of DeliveryBench: image, instruction, state, action schema",
+        waived={"images": ("images", False)},
+    )

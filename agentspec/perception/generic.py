@@ -23,7 +23,10 @@ class GenericPerception:
         images: pass the observation's `image` on, for models that see.
     """
 
-    declaration = Declaration("image, instruction, state and action schema of any environment that keeps the contract")
+    declaration = Declaration(
+        "image, instruction, state and action schema of any environment that keeps the contract",
+        waived={"images": ("images", False)},
+    )
 
     def __init__(self, images: bool = False) -> None:
         self.images = images

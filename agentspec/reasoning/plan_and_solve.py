@@ -103,6 +103,7 @@ class PlanAndSolve:
             "think": Purpose("step"),
             "act": Purpose("step"),
         },
+        small=({"persistent": True, "think": True, "replan_every": 4}, {"persistent": False, "think": True}),
     )
 
     def __init__(

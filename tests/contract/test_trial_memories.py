@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -118,11 +117,13 @@ def test_ids_and_time_go_on_from_episode_to_episode() -> None:
 
 
 def test_evicted_turns_leave_their_summary_and_shorten_the_prompt() -> None:
-    case = small("blocks")
-    spec = AgentSpec.from_data({"memory": {"name": "blocks", "pressure": 400, "keep": 1}})
-    task = Task(NUMBERS, 0, {"steps": LENGTH, "target": 1000})
-    (trajectory,) = Runner(spec, ScriptedLLM(example(case))).run([Job(task)])
-    acts = [c for c in trajectory.calls if c.tag.purpose == "act"]
-    lengths = [len(c.prompt_ids) for c in acts]
-    assert any(b < a for a, b in itertools.pairwise(lengths))
-    assert b"The number grew." in bytes(i for i in acts[-1].prompt_ids if i < 256)
+    last = {}
+    for pressure in (400, 1_000_000):
+        spec = AgentSpec.from_data({"memory": {"name": "blocks", "pressure": pressure, "keep": 1}})
+        task = Task(NUMBERS, 0, {"steps": LENGTH, "target": 1000})
+        (trajectory,) = Runner(spec, ScriptedLLM(example(small("blocks")))).run([Job(task)])
+        acts = [c for c in trajectory.calls if c.tag.purpose == "act" and c.tag.step == LENGTH - 1]
+        last[pressure] = bytes(i for i in acts[0].prompt_ids if i < 256)
+    assert b"The number grew." in last[400] and b"The number grew." not in last[1_000_000]
+    # One step of twelve is held, not eleven.
+    assert last[400].count(b"The number is") == 2 and last[1_000_000].count(b"The number is") == LENGTH

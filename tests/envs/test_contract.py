@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from agentspec.envs import ENTRY_POINTS, ContractError, check_environment
+from agentspec.envs import ENTRY_POINTS, ContractError, check_environment, make_env
 from agentspec.envs.contract import INFO_KEYS
 from agentspec.metrics import Metric
 from agentspec.registry import REGISTRY
@@ -40,6 +40,17 @@ def test_every_environment_of_ours_has_a_short_name() -> None:
 @pytest.mark.parametrize("menu", [False, True])
 def test_the_test_worlds_keep_it_too(name: str, menu: bool) -> None:
     check_environment(Task(name, options={"menu": menu}))
+
+
+def test_a_limit_of_steps_really_ends_an_episode() -> None:
+    task = Task(TOY, options={"max_episode_steps": 2})
+    check_environment(task)
+    env = make_env(task)
+    env.reset(seed=0)
+    reports = [env.step("SELL()") for _ in range(4)]
+    assert [r[3] for r in reports] == [False, True, True, True]
+    assert [r[1] > 0 for r in reports] == [True, True, False, False]
+    assert env.unwrapped.t == 2  # gymnasium's limit alone would let the toy sell on
 
 
 class Broken(ToyEnv):
@@ -138,6 +149,15 @@ def test_a_menu_entry_that_cannot_be_done_is_a_fault() -> None:
 
     with pytest.raises(ContractError, match="'double it' cannot be carried out: doubling is not possible"):
         check_environment(Boasting(menu=True))
+
+
+def test_charged_thinking_is_reported() -> None:
+    class Forgetful(NumbersEnv):
+        def deliberate(self, calls: int, tokens: int) -> None:
+            return None
+
+    with pytest.raises(ContractError, match=r"reports info\['thought'\] \[\]; expected \[2, 10\]"):
+        check_environment(Forgetful())
 
 
 def test_half_a_pair_of_snapshot_methods_is_a_fault() -> None:

@@ -12,13 +12,14 @@ import pytest
 
 from agentspec.episode import make_env
 from agentspec.llm.scripted import ScriptedLLM
+from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tasks import task_sets
 from agentspec.trajectory import read_trajectories
 from agentspec.types import Task
 from eval.matrix import evaluate
-from eval.policies import Policy
-from eval.tasks import task_sets
+from eval.tables import markdown
 from tests.toy_env import TOY
 
 PLAIN = AgentSpec()
@@ -154,6 +155,14 @@ def test_what_cannot_work_is_refused_before_anything_is_played(tmp_path: Path) -
         with pytest.raises(SpecError, match=message):
             attempt()
     assert not list(tmp_path.iterdir())
+
+
+def test_any_environment_of_gymnasium_is_evaluated(tmp_path: Path) -> None:
+    tasks = [Task("CartPole-v1", seed) for seed in range(2)]
+    rows = evaluate([Policy("random")], {"plain": PLAIN}, tasks, out=tmp_path)
+    assert [row["return"] for row in rows] == [row["steps"] for row in rows]  # a point for every step
+    text = markdown(rows)
+    assert "## CartPole-v1: return" in text and "| random |" in text and "profit" not in text
 
 
 def test_tasks_are_split_by_environment_and_options() -> None:

@@ -1,81 +1,224 @@
-"""Intervals whose exact values are known."""
+"""Intervals and tests whose exact values are known, or are SciPy's and statsmodels'."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
+import numpy as np
 import pytest
+
+pytest.importorskip("scipy", reason="needs the extra eval")
+pytest.importorskip("statsmodels", reason="needs the extra eval")
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from eval.statistics import Estimate, bootstrap, crossed_bootstrap, paired_difference
+from eval.statistics import (
+    Estimate,
+    bootstrap,
+    compare_runs,
+    corrected,
+    holm,
+    interactions,
+    interquartile_mean,
+    mean_interval,
+    minimum_detectable_effect,
+    paired,
+    performance_profile,
+    runs_mean,
+    sign_flip,
+)
 
-
-def test_two_values() -> None:
-    # Means of two draws from {0, 1}: 0 with probability 1/4, 0.5 with 1/2, 1 with 1/4. The 2.5 % and 97.5 % quantiles
-    # are therefore 0 and 1, the 30 % and 70 % quantiles (an interval of 40 %) both 0.5.
-    assert bootstrap([0.0, 1.0]) == Estimate(0.5, 0.0, 1.0, 2)
-    assert bootstrap([0.0, 1.0], level=0.4) == Estimate(0.5, 0.5, 0.5, 2)
-
-
-def test_constant_values_have_a_point_as_interval() -> None:
-    assert bootstrap([2.5] * 7) == Estimate(2.5, 2.5, 2.5, 7)
-
-
-def test_the_interval_approaches_the_normal_one() -> None:
-    # 200 zeros and 200 ones: the standard error of the mean is 0.5 / sqrt(400) = 0.025, so 95 % is 0.5 -+ 0.049.
-    estimate = bootstrap([0.0, 1.0] * 200)
-    assert estimate.low == pytest.approx(0.451, abs=0.004)
-    assert estimate.high == pytest.approx(0.549, abs=0.004)
-
-
-def test_the_seed_fixes_the_interval() -> None:
-    values = [0.3, 1.7, -2.0, 5.0, 0.0]
-    whole = bootstrap(values, seed=3)
-    assert bootstrap(values, seed=3) == whole
-    assert bootstrap(values, seed=4) != whole
+some = st.lists(st.floats(-100, 100), min_size=2, max_size=9)
 
 
-def test_too_few_values_have_no_interval() -> None:
-    one, none = bootstrap([4.0]), bootstrap([])
-    assert (one.mean, one.n) == (4.0, 1) and math.isnan(one.low) and math.isnan(one.high)
-    assert math.isnan(none.mean) and none.n == 0
-    assert one.to_data() == {"mean": 4.0, "low": None, "high": None, "n": 1}
+def test_t_interval_of_three_values():
+    # mean 2, s = 1, t(2, .975) = 4.3027: 2 -+ 4.3027 / sqrt 3 = 2 -+ 2.4841
+    estimate = mean_interval([1.0, 2.0, 3.0])
+    assert (estimate.mean, estimate.n, estimate.unit) == (2.0, 3, "seed")
+    assert (estimate.low, estimate.high) == pytest.approx((-0.4841, 4.4841), abs=1e-4)
 
 
-def test_pairing_removes_what_tasks_share() -> None:
-    # Tasks differ by hundreds, policies by exactly 2: the difference is certain although the means overlap widely.
-    b = {"easy": 900.0, "hard": 10.0, "fair": 300.0, "only b": 5.0}
-    a = {"easy": 902.0, "hard": 12.0, "fair": 302.0, "only a": 1.0}
-    assert paired_difference(a, b) == Estimate(2.0, 2.0, 2.0, 3)
+@settings(deadline=None)
+@given(some)
+def test_t_interval_is_scipys(values):
+    low, high = stats.t.interval(0.9, len(values) - 1, np.mean(values), stats.sem(values))
+    estimate = mean_interval(values, level=0.9)
+    if np.std(values) > 1e-9:
+        assert (estimate.low, estimate.high) == pytest.approx((low, high), abs=1e-8)
 
 
-def test_refusals() -> None:
-    with pytest.raises(ValueError, match="level"):
-        bootstrap([1.0], level=1.0)
-    with pytest.raises(ValueError, match="resamples"):
-        bootstrap([1.0], resamples=0)
-    with pytest.raises(ValueError, match="finite"):
-        bootstrap([1.0, math.nan])
+def test_too_few_values_have_no_interval_and_no_verdict():
+    one, none = mean_interval([4.0]), mean_interval([])
+    assert one.mean == 4.0 and math.isnan(one.low) and one.tie()
+    assert math.isnan(none.mean) and none.to_data() == {
+        **dict.fromkeys(("mean", "low", "high", "p")), "n": 0, "unit": "seed", "note": "",
+    }  # fmt: skip
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=20))
-def test_the_interval_lies_within_the_values(values: list[float]) -> None:
-    estimate = bootstrap(values, resamples=200)
-    assert min(values) - 1e-9 <= estimate.low <= estimate.high <= max(values) + 1e-9
+def test_sign_flip_counts_flips():
+    # Sums of +-1 +-2 +-3: |6| twice of eight
+    assert sign_flip([1.0, 2.0, 3.0]) == 0.25
+    assert sign_flip([1.0, -1.0]) == 1.0
+    assert sign_flip([0.0, 0.0]) == 1.0
+    # five equal signs of five: 2 / 32
+    assert sign_flip([3.0, 1.0, 4.0, 1.0, 5.0]) == 2 / 32
+    assert math.isnan(sign_flip([]))
 
 
-def test_crossed_bootstrap_covers_runs_and_tasks() -> None:
-    same = crossed_bootstrap([[1.0, 3.0, 5.0, 7.0]] * 3)
-    tasks_only = bootstrap([1.0, 3.0, 5.0, 7.0])
-    assert same.mean == tasks_only.mean == 4.0
-    assert same.low == pytest.approx(tasks_only.low, abs=0.5) and same.high == pytest.approx(tasks_only.high, abs=0.5)
-    # Runs that differ widen it, though the tasks agree: their mean alone has no spread over tasks.
-    runs = crossed_bootstrap([[0.0] * 4, [10.0] * 4])
-    assert (runs.mean, runs.low, runs.high) == (5.0, 0.0, 10.0)
-    assert bootstrap([5.0] * 4).low == 5.0
-    one = crossed_bootstrap([[1.0, 3.0, 5.0, 7.0]])
-    assert one == tasks_only
-    with pytest.raises(ValueError, match="same tasks for every run"):
-        crossed_bootstrap([[1.0], [1.0, 2.0]])
+@settings(deadline=None)
+@given(st.lists(st.integers(-5, 5).map(float), min_size=2, max_size=8))
+def test_sign_flip_is_scipys_permutation_test(values):
+    found = stats.permutation_test(
+        (np.array(values),), np.mean, permutation_type="samples", n_resamples=np.inf, vectorized=False
+    )
+    assert sign_flip(values) == pytest.approx(found.pvalue)
+
+
+def test_many_values_are_flipped_at_random_reproducibly():
+    values = [1.0 + 0.1 * i for i in range(20)]
+    assert sign_flip(values) == pytest.approx(1 / 10_001)  # no random flip of 20 equal signs is as far
+    rng = np.random.default_rng(0)
+    noise = list(rng.normal(0.2, 1, 30))
+    assert sign_flip(noise, seed=1) == sign_flip(noise, seed=1)
+    assert sign_flip(noise, seed=1) == pytest.approx(stats.ttest_1samp(noise, 0).pvalue, abs=0.03)
+
+
+def test_pairs_are_by_seed_and_say_what_they_are_about():
+    # Differences 1, 2, 3; seed 9 is on one side only
+    estimate = paired({1: 2.0, 2: 4.0, 3: 6.0, 9: 100.0}, {3: 3.0, 2: 2.0, 1: 1.0})
+    assert (estimate.mean, estimate.n, estimate.p, estimate.note) == (2.0, 3, 0.25, "this checkpoint only")
+    assert estimate.tie()
+
+
+def test_runs_are_the_unit_from_three_runs_on():
+    runs = [{0: 1.0, 1: 3.0}, {0: 2.0, 1: 4.0}, {0: 3.0, 1: 5.0, 2: 99.0}]
+    three = runs_mean(runs)  # run means 2, 3, 4 on the seeds that all have
+    assert (three.mean, three.n, three.unit, three.note) == (3.0, 3, "run", "")
+    assert three.high - three.mean == pytest.approx(4.3027 / math.sqrt(3), abs=1e-4)
+    two = runs_mean(runs[:2])  # seeds: 1.5, 3.5
+    assert (two.mean, two.n, two.unit, two.note) == (2.5, 2, "seed", "this checkpoint only")
+
+
+def test_two_recipes_are_compared_by_welch_over_runs():
+    a = [{0: 1.0, 1: 3.0}, {0: 2.0, 1: 4.0}, {0: 6.0, 1: 5.0}]
+    b = [{0: 0.0, 1: 1.0}, {0: 1.0, 1: 1.0}, {0: 0.0, 1: 0.0}, {0: 2.0, 1: 2.0}]
+    means = [2.0, 3.0, 5.5], [0.5, 1.0, 0.0, 2.0]
+    expected = stats.ttest_ind(*means, equal_var=False)
+    found = compare_runs(a, b)
+    assert found.p == pytest.approx(expected.pvalue) and found.unit == "run" and found.n == 3
+    interval = expected.confidence_interval()
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high))
+
+
+def test_runs_against_a_fixed_policy_are_one_sample():
+    start = [{0: 1.0, 1: 1.0}]
+    found = compare_runs([{0: 2.0, 1: 2.0}, {0: 3.0, 1: 3.0}, {0: 4.0, 1: 4.0}], start)
+    assert (found.mean, found.unit) == (2.0, "run")
+    assert found.p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 3.0], 0).pvalue)
+
+
+def test_too_few_runs_speak_of_themselves():
+    found = compare_runs([{0: 2.0, 1: 2.0}], [{0: 1.0, 1: 0.0}])
+    assert (found.mean, found.n, found.note) == (1.5, 2, "this checkpoint only")
+
+
+def test_runs_without_any_spread():
+    same = [{0: 1.0}] * 3
+    assert compare_runs(same, same).p == 1.0 and compare_runs(same, [{0: 0.0}] * 3).p == 0.0
+    assert compare_runs(same, [{0: 0.0}]).p == 0.0
+
+
+def test_holm_steps_down():
+    # sorted .01 .03 .04: 3 * .01, 2 * .03, max(.06, .04); NaN does not count
+    assert holm([0.04, math.nan, 0.01, 0.03]) == pytest.approx([0.06, math.nan, 0.03, 0.06], nan_ok=True)
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    table = corrected([Estimate(1, 0, 2, 9, p=0.03), Estimate(1, 0, 2, 9, p=0.04)])
+    assert [e.p for e in table] == [0.06, 0.06] and all(e.tie() for e in table)
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_holm_is_statsmodels(p_values):
+    from statsmodels.stats.multitest import multipletests
+
+    assert holm(p_values) == pytest.approx(list(multipletests(p_values, method="holm")[1]))
+
+
+def test_bootstrap_is_refused_for_few_values_and_near_the_t_interval_for_many():
+    with pytest.raises(ValueError, match="bootstrap of 31 values would be too narrow; it needs 32"):
+        bootstrap([0.0] * 31)
+    values = list(np.random.default_rng(0).normal(0, 1, 200))
+    a, b = bootstrap(values), mean_interval(values)
+    assert (a.low, a.high) == pytest.approx((b.low, b.high), abs=0.02)
+    assert bootstrap(values, seed=1) == bootstrap(values, seed=1) != bootstrap(values, seed=2)
+
+
+def test_interquartile_mean_leaves_out_a_quarter_on_each_side():
+    # 0 .. 31 and far outliers in the outer quarters: the middle 16 are 8 .. 23, mean 15.5
+    values = [-1e6 if i < 8 else 1e6 if i > 23 else float(i) for i in range(32)]
+    assert interquartile_mean(values).mean == 15.5
+
+
+def test_performance_profile():
+    assert performance_profile([0.0, 1.0, 2.0, 2.0], [-1, 0, 1.5, 2]) == [1.0, 0.75, 0.5, 0.0]
+
+
+def test_minimum_detectable_effect():
+    # n = 32, power .8, two-sided .05: d = .5116 (statsmodels); by simulation, the power there is .8
+    effect = minimum_detectable_effect(2.0, 32)
+    assert effect == pytest.approx(1.0232, abs=2e-3)
+    rng = np.random.default_rng(0)
+    found = [stats.ttest_1samp(rng.normal(effect, 2.0, 32), 0).pvalue < 0.05 for _ in range(2000)]
+    assert np.mean(found) == pytest.approx(0.8, abs=0.03)
+    with pytest.raises(ValueError, match="n=1"):
+        minimum_detectable_effect(1.0, 1)
+
+
+def rows(cells, seeds=8, noise=0.0):
+    rng = np.random.default_rng(0)
+    day = rng.normal(0, 3, seeds)
+    return [
+        {"reasoning": a, "memory": b, "seed": s, "return": value + day[s] + noise * rng.normal()}
+        for (a, b), value in cells.items()
+        for s in range(seeds)
+    ]
+
+
+def test_interaction_is_the_departure_from_the_sum():
+    # react +1, dc +2, both +5 instead of +3: interaction 2
+    cells = {("direct", "base"): 0.0, ("react", "base"): 1.0, ("direct", "dc"): 2.0, ("react", "dc"): 5.0}
+    found = interactions(rows(cells, noise=0.01), "return", ("reasoning", "memory"))
+    assert list(found) == [("react", "dc")]
+    assert found["react", "dc"].mean == pytest.approx(2.0, abs=0.02) and not found["react", "dc"].tie()
+
+
+def test_interactions_are_statsmodels_formula():
+    import pandas
+    import statsmodels.formula.api as smf
+
+    cells = {(a, b): float(i) for i, (a, b) in enumerate(itertools.product("xyz", "pq"))}
+    data = rows(cells, noise=1.0)
+    frame = pandas.DataFrame(data).rename(columns={"return": "value"})
+    fitted = smf.ols("value ~ C(reasoning) * C(memory)", frame).fit(
+        cov_type="cluster", cov_kwds={"groups": frame["seed"]}, use_t=True
+    )
+    found = interactions(data, "return", ("reasoning", "memory"))
+    names = ["C(reasoning)[T.y]:C(memory)[T.q]", "C(reasoning)[T.z]:C(memory)[T.q]"]
+    assert [e.mean for e in found.values()] == pytest.approx([fitted.params[n] for n in names])
+    assert [e.low for e in found.values()] == pytest.approx([fitted.conf_int()[0][n] for n in names])
+    assert [e.p for e in found.values()] == pytest.approx(holm([fitted.pvalues[n] for n in names]))
+
+
+def test_a_design_with_holes_has_no_interactions():
+    cells = {("direct", "base"): 0.0, ("react", "base"): 1.0, ("direct", "dc"): 2.0}
+    with pytest.raises(ValueError, match=r"missing: \[\('react', 'dc'\)\]"):
+        interactions(rows(cells), "return", ("reasoning", "memory"))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_refused(bad):
+    with pytest.raises(ValueError, match="leave failed episodes out"):
+        mean_interval([1.0, bad])

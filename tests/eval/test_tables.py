@@ -18,6 +18,7 @@ from eval.tables import differences, markdown, show, summarise, table, write_rep
 
 def row(policy: str, task: str, profit: float | None, *, scaffold: str = "plain", **changes: Any) -> dict[str, Any]:
     return {
+        "env": "deliverybench",
         "tasks": "city",
         "policy": policy,
         "scaffold": scaffold,
@@ -63,7 +64,11 @@ def test_differences_are_paired_by_task() -> None:
         "mean": 5.0,
         "low": 5.0,
         "high": 5.0,
+        "p": 0.5,  # of the four flips of (5, 5), two are as far from 0
+        "tie": True,
         "n": 2,
+        "unit": "seed",
+        "note": "this checkpoint only",
     }
     assert differences(ROWS, "hourly_profit", by="scaffold") == []
     with pytest.raises(ValueError, match="'policy' or 'scaffold'"):
@@ -75,12 +80,13 @@ def test_markdown_has_matrix_details_and_differences() -> None:
     text = markdown(rows)
     assert "## city: hourly profit ($/h)" in text
     assert "| policy | plain | react\\|x |" in text
-    assert "| base | 2.00 [1.00, 3.00] | 3.50 [2.00, 5.00] |" in text
-    assert "| tuned | 38.00 [6.00, 100.00] | – |" in text
+    # t(1, .975) = 12.706: 2 -+ 12.706 * 1 and 3.5 -+ 12.706 * 1.5; t(2, .975) = 4.3027: 38 -+ 4.3027 * 31.01
+    assert "| base | 2.00 [-10.71, 14.71] | 3.50 [-15.56, 22.56] |" in text
+    assert "| tuned | 38.00 [-95.41, 171.41] | – |" in text
     assert "| base | plain | 3 | 1 | 0 | 2.00 | 10.0 |" in text
-    assert "| plain | tuned - base | 5.00 [5.00, 5.00] | 2 |" in text
+    assert "| plain | tuned - base | 5.00 [5.00, 5.00] | 0.500 | tie | 2 |" in text
     # by scaffold: 2 - 1 = 1 and 5 - 3 = 2
-    assert "| base | react\\|x - plain | 1.50 [1.00, 2.00] | 2 |" in text
+    assert "| base | react\\|x - plain | 1.50 [-4.85, 7.85] | 0.500 | tie | 2 |" in text
     assert markdown([]) == "No episodes.\n"
 
 

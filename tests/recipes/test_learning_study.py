@@ -18,6 +18,7 @@ from trainers.arguments import parse_config
 def rows(policy: str, scaffold: str, values: list[float]) -> list[dict[str, object]]:
     return [
         {
+            "env": "deliverybench",
             "policy": policy,
             "scaffold": scaffold,
             "tasks": "t",
@@ -34,15 +35,24 @@ def test_gains_are_paired_by_task() -> None:
         *rows("start", "bare", [1.0, 2.0, 3.0, 4.0]),
         *rows("grpo-s0", "bare", [3.0, 4.0, 5.0, 6.0]),  # +2 on every task: no spread
         *rows("grpo-s1", "bare", [5.0, 6.0, 7.0, 8.0]),  # +4
+        *rows("grpo-s2", "bare", [4.0, 5.0, 6.0, 7.0]),  # +3
     ]
-    text = gains(played, {"grpo": [0, 1]}, {"grpo": "bare"})
+    text = gains(played, {"grpo": [0, 1, 2]}, {"grpo": "bare"})
     line = next(line for line in text.splitlines() if line.startswith("| grpo"))
     cells = [c.strip() for c in line.strip("|").split("|")]
     assert cells[1] == "bare (its own)"
     assert cells[2].startswith("2.50 ") and cells[3].startswith("5.50 ")
-    assert cells[4] == "3.00 [2.00, 4.00]"  # between the two runs, whatever the tasks
-    assert cells[5] == "2.00 [2.00, 2.00], 4.00 [4.00, 4.00]"
-    assert cells[6] == "4"
+    # Gains of the runs 2, 4, 3: 3 -+ 4.3027 / sqrt 3, t = 3 sqrt 3 with 2 degrees of freedom: p = .0351
+    assert cells[4:7] == ["3.00 [0.52, 5.48]", "0.035", "gain"]
+    assert cells[7] == "2.00 [2.00, 2.00], 4.00 [4.00, 4.00], 3.00 [3.00, 3.00]"
+    assert cells[8] == "4"
+
+
+def test_one_run_says_nothing_about_its_recipe() -> None:
+    played = [*rows("start", "bare", [1.0, 2.0]), *rows("grpo-s0", "bare", [3.0, 4.0])]
+    line = gains(played, {"grpo": [0]}, {"grpo": "bare"}).splitlines()[-1]
+    # Two seeds, both +2: of four flips two are as far, p = .5
+    assert "| 0.500 | tie |" in line
 
 
 def test_a_task_that_failed_for_one_run_counts_for_none() -> None:

@@ -18,6 +18,7 @@ from transformers import TrainerCallback
 
 from agentspec.registry import SpecError
 from agentspec.types import Sampling
+from benchmarks.exactness import make_batch, oracle_loss, relative_error, tiny_policy, trained_tokens
 from rewards import RewardSet
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.trainers.builders import call, episode, instead_of_playing
@@ -214,3 +215,29 @@ def test_no_optimiser_step_is_empty_while_rows_are_left(tmp_path: Path, monkeypa
     assert sorted(filled) == [1] * 7 + [2]
     (receipt,) = RunLog(tmp_path).read("updates.jsonl")
     assert len(receipt["rows"]) == 9 and json.dumps(receipt)
+
+
+@pytest.mark.parametrize(
+    ("loss_type", "estimator", "packing"),
+    [
+        ("dapo", "gigpo", "tree"),
+        ("dppo", "max_rl", "padded"),
+        ("dr_grpo", "reward_to_go", "tree"),
+        ("bnpo", "rloo", "tree"),
+    ],
+)
+def test_gradients_are_those_of_the_written_out_formulas(loss_type: str, estimator: str, packing: str) -> None:
+    """Four of the cases of `python -m benchmarks.exactness`, whose oracle shares no numerics with the trainer."""
+    assert relative_error({"loss_type": loss_type, "estimator": estimator, "packing": packing}) < 1e-5
+
+
+def test_the_oracle_sees_another_objective() -> None:
+    """What it compares is not equal whatever the trainer does."""
+    config = {"loss_type": "dapo", "estimator": "grpo", "packing": "tree"}
+    model, base = tiny_policy(lora=False)
+    batch = make_batch(model.double(), 0)
+    values = [
+        float(oracle_loss(trained_tokens(model, base, batch, config | c), config | c, len(batch)).detach())
+        for c in ({}, {"estimator": "rloo"}, {"loss_type": "dppo"}, {"overlong": "keep"}, {"normalize": "rollout"})
+    ]
+    assert len({round(v, 6) for v in values}) == len(values)

@@ -332,6 +332,7 @@ def test_what_cannot_work_is_refused(tmp_path: Path, folders: dict[str, str], wh
 
 def test_a_trainer_is_given_what_trains_a_reflector(tmp_path: Path, folders: dict[str, str]) -> None:
     args = config(tmp_path, folders)
+    args.agent = {**args.agent, "scope": "run"}
     with pytest.raises(SpecError, match="when: start"):
         RetroformerTrainer(torch.nn.Linear(1, 1), args)
     with pytest.raises(SpecError, match="retroformer_delivery"):

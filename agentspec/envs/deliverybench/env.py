@@ -230,9 +230,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         `last` is what info says of the last step, if that is not the step that led here.
         """
         world, last = self.world, last or self._last
-        view = describe(world, self._cards)
-        if self.max_steps is not None:
-            view["calls_left"] = max(0, self.max_steps - self._steps)
+        view = self._view()
         self._menu = self._options(view)
         observation: Observation = {"text": _printable(self._text(view))}
         if self.images:
@@ -294,7 +292,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         self._world.restore(blob)
         self._steps, self._last, self._track, self._thought = steps, Last(**last), track, thought
         self._page, self._plan = page, plan
-        self._menu = self._options(describe(self._world, self._cards)) if self.menu_mode else {}
+        self._menu = self._options(self._view()) if self.menu_mode else {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         blob = None if self._world is None else self.snapshot()
@@ -313,6 +311,13 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
     @property
     def _out_of_steps(self) -> bool:
         return self._steps >= (self.max_steps or STEP_LIMIT)
+
+    def _view(self) -> dict[str, Any]:
+        """What the courier can know now, with the steps left where they are limited."""
+        view = describe(self.world, self._cards)
+        if self.max_steps is not None:
+            view["calls_left"] = max(0, self.max_steps - self._steps)
+        return view
 
     def _options(self, view: Mapping[str, Any]) -> dict[str, Option]:
         if not self.menu_mode:

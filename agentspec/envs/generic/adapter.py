@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
+from agentspec.envs.finished import FinishedEpisode
 from agentspec.envs.generic.describe import as_json, describe, is_picture, plain
 from agentspec.envs.generic.names import Names, names_of
 from agentspec.registry import SpecError
@@ -45,8 +46,11 @@ def keeps_contract(env: Any) -> bool:
 
 
 def adapted(env: Any, name: str) -> Any:
-    """`env` itself if it keeps the contract, else behind a `TextAdapter`."""
-    return env if keeps_contract(env) else TextAdapter(env, name)
+    """`env` itself if it keeps the contract (a limit of steps made to end it), else behind a `TextAdapter`."""
+    if not keeps_contract(env):
+        return TextAdapter(env, name)
+    limited = env.spec is not None and env.spec.max_episode_steps is not None
+    return FinishedEpisode(env) if limited and not isinstance(env, FinishedEpisode) else env
 
 
 class TextAdapter(gymnasium.Env[dict[str, Any], str]):
@@ -164,8 +168,10 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
             observation["image"] = self._picture()
         told = as_json(self._told) if isinstance(self._told, Mapping) else {}
         success = told.get("success", told.get("is_success"))
+        achieved = {} if success is None else {"success": bool(success)}
         info = {
             **told,
+            **achieved,
             "instruction": self._instruction(),
             "action_schema": self._schema(),
             "state": {"observation": plain(space, self._seen), "steps": self._steps},
@@ -173,7 +179,7 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
             "error_code": code,
             "message": f"failed: {error}" if error else "ok" if self._steps else "",
             "invalid": bool(error),
-            "metrics": {} if success is None else {"success": bool(success)},
+            "metrics": achieved,
         }
         self._over = terminated or truncated
         self._last = (observation, terminated, truncated, info)

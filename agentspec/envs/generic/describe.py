@@ -46,17 +46,7 @@ def describe(space: spaces.Space[Any], value: Any, names: Sequence[str] = ()) ->
     if is_picture(space):
         height, width = np.shape(value)[:2]
         return f"[a picture of {width} x {height} pixels]"
-    if isinstance(value, str):
-        return value
-    array = np.asarray(value)
-    if array.dtype == object:
-        return str(value)[:MAX_NUMBERS]
-    if array.ndim == 0:
-        return _named([_number(array[()])], names)
-    if array.ndim == 1 and array.size <= MAX_NUMBERS:
-        return _named([_number(v) for v in array], names)
-    grid = _grid(array) if array.ndim in (2, 3) else None
-    return grid or _numbers(array)
+    return value if isinstance(value, str) else _array(np.asarray(value), names)
 
 
 def plain(space: spaces.Space[Any], value: Any) -> Any:
@@ -77,6 +67,15 @@ def as_json(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     return value if value is None or isinstance(value, (str, bool, int, float)) else str(value)
+
+
+def _array(array: np.ndarray, names: Sequence[str]) -> str:
+    if array.dtype == object:
+        return str(array[()])[:MAX_NUMBERS]
+    if array.ndim < 2 and array.size <= MAX_NUMBERS:
+        return _named([_number(v) for v in np.atleast_1d(array)], names)
+    grid = _grid(array) if array.ndim in (2, 3) else None
+    return grid or _numbers(array)
 
 
 def _keyed(key: str, text: str) -> str:

@@ -1,7 +1,8 @@
 """What the numbers of well-known environments mean: names of actions and of parts of the observation.
 
 Gymnasium's spaces are numbers without names. Environments that name their actions themselves are asked
-(`get_action_meanings()`, or an `actions` enumeration); for Gymnasium's own the names stand here, from its documentation.
+(`get_action_meanings()`, or an `actions` enumeration); for Gymnasium's own the names stand here, from its
+documentation.
 """
 
 from __future__ import annotations

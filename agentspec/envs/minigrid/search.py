@@ -84,7 +84,7 @@ def _progress(instruction: Any) -> tuple[Any, ...]:
     """What BabyAI's instructions remember of what was done."""
     if instruction is None:
         return ()
-    own = []
+    own: list[tuple[str, Any]] = []
     for name, value in sorted(vars(instruction).items()):
         if isinstance(value, bool | str) or value is None:
             own.append((name, value))

@@ -207,14 +207,28 @@ def test_courier_state_survives_a_snapshot() -> None:
 
 
 def test_the_courier_never_sleeps_beside_open_offers() -> None:
-    """With two of sixty steps left nothing can be delivered; the rest of the shift used to be waited away at once."""
-    env = DeliveryBenchEnv(size="tiny", city_seed=0, max_steps=60)
+    """With two steps left nothing can be delivered; the whole rest of the shift used to be waited away at once."""
+    env = DeliveryBenchEnv(size="tiny", max_steps=2)
     _, info = env.reset(seed=1)
-    courier, ended, waits = RuleBasedCourier(env.city), False, []
-    while not ended:
-        action = courier.act(info)
-        if action.startswith("WAIT(") and not info["state"]["orders"]:
-            waits.append(float(action[5:-1]))
-        _, _, terminated, truncated, info = env.step(action)
-        ended = terminated or truncated
-    assert truncated and len(info["state"]["offers"]) == 10 and waits and max(waits) <= 60.0
+    courier = RuleBasedCourier(env.city)
+    assert len(info["state"]["offers"]) == 10 and courier.act(info) == "WAIT(60)"
+    # Where the number of actions is not limited, nothing comes of waiting in small pieces.
+    free = DeliveryBenchEnv(size="tiny", shift_hours=0.02)
+    _, info = free.reset(seed=1)
+    assert courier.act(info) == "WAIT(72)"
+
+
+def test_with_few_actions_left_no_car_is_rented() -> None:
+    """A car costs two actions and a dollar a minute: of sixteen actions too much, and the menu puts it further back."""
+    earned = []
+    for seed in range(8):
+        env = DeliveryBenchEnv(**QUICK)
+        _, info = env.reset(seed=seed)
+        courier, ended = RuleBasedCourier(env.city), False
+        while not ended:
+            assert not any("car" in choice for choice in info["action_schema"].choices)
+            _, _, terminated, truncated, info = env.step(courier.act(info))
+            ended = terminated or truncated
+        earned.append(info["net_earnings"])
+    # It was 17 dollars with the earlier, smaller menu, and 11 with the car.
+    assert mean(earned) > 15.0

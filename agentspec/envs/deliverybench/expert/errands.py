@@ -16,6 +16,9 @@ from agentspec.envs.deliverybench.view import calls
 from agentspec.envs.deliverybench.view.calls import View, within_reach
 
 DRINK, PACK = "energy_drink", "escooter_battery_pack"
+ACTION_S = 15.0
+"""About what an action takes, where their number and not the shift limits what lies ahead."""
+
 RIDE = 'SWITCH(to="e-scooter")'
 
 
@@ -24,7 +27,7 @@ class Upkeep:
     """When to look after oneself.
 
     Attributes:
-        car: rent a car when the shift leaves at least `car_from` seconds.
+        car: rent a car when the shift leaves at least `car_from` seconds, and `car_actions` where actions are limited.
         energy_per_s: expected use of energy (%/s), for the number of drinks to buy.
         battery_per_s: expected use of battery (%/s) on the scooter.
         drink_below: drink when energy is at most this.
@@ -34,6 +37,7 @@ class Upkeep:
 
     car: bool = True
     car_from: float = 900.0
+    car_actions: int = 40
     energy_per_s: float = 0.085
     battery_per_s: float = 0.12
     drink_below: float = 50.0
@@ -60,6 +64,8 @@ def wants_car(view: View, upkeep: Upkeep) -> bool:
     """Whether renting a car pays: there is a rental, no car yet, money, and enough of the shift left."""
     rental = view["nearest"].get("car_rental")
     if not upkeep.car or view["car"] is not None or rental is None or view["balance"] < 30.0:
+        return False
+    if view.get("calls_left") is not None and view["calls_left"] < upkeep.car_actions:
         return False
     return bool(view["left_s"] - rental["m"] / view["speed"] >= upkeep.car_from)
 
@@ -143,14 +149,15 @@ def wanted(view: View, upkeep: Upkeep) -> dict[str, int]:
     money = view["balance"] - upkeep.reserve
     shopping_list = {}
     on_scooter = view["car"] is None
-    energy_need = view["left_s"] * upkeep.energy_per_s * (0.6 if on_scooter else 1.0)
+    left = view["left_s"] if view.get("calls_left") is None else min(view["left_s"], ACTION_S * view["calls_left"])
+    energy_need = left * upkeep.energy_per_s * (0.6 if on_scooter else 1.0)
     drinks = math.ceil((energy_need - view["energy"] - 50.0 * view["inventory"].get(DRINK, 0)) / 50.0)
     if drinks > 0 and money >= 6.0:
         shopping_list[DRINK] = count = min(drinks, int(money // 6.0))
         money -= 6.0 * count
     if on_scooter and not upkeep.car:
         packs = math.ceil(
-            (view["left_s"] * upkeep.battery_per_s - view["battery"] - 100.0 * view["inventory"].get(PACK, 0)) / 100.0
+            (left * upkeep.battery_per_s - view["battery"] - 100.0 * view["inventory"].get(PACK, 0)) / 100.0
         )
         if packs > 0 and money >= 10.0:
             shopping_list[PACK] = min(packs, int(money // 10.0))

@@ -11,7 +11,7 @@ from agentspec.envs.deliverybench.view.hints import hints
 from agentspec.envs.deliverybench.view.wording import HERE, SHORT_MODE, at, away, cut, deadline, minutes
 
 COMPACT_OFFERS = 3
-LOW = 40.0
+LOW, THIRSTY = 40.0, 50.0
 
 
 def compact_text(view: View, message: str) -> str:
@@ -34,8 +34,10 @@ def menu_text(view: View, message: str, choices: Sequence[Option]) -> str:
     place = f", at {view['place']}" if view["place"] else ""
     first = (
         f"{minutes(view['left_s'])} min left{place}, {SHORT_MODE.get(view['mode'], view['mode'])}, "
-        f"battery {view['battery']:.0f}%, energy {view['energy']:.0f}%, earned ${view['net_earnings']:.1f}"
+        f"battery {view['battery']:.0f}%, earned ${view['net_earnings']:.1f}"
     )
+    if view["energy"] <= THIRSTY:
+        first += f", energy {view['energy']:.0f}%"
     if view["charging"] is not None:
         first += f", charging {minutes(view['charging']['left_s'])} min more"
     lines = [first, *(_menu_order(order) for order in view["orders"])]

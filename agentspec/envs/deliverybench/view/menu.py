@@ -12,16 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agentspec.envs.deliverybench.view import calls, choices
+from agentspec.envs.deliverybench.view import calls, choices, upkeep
 from agentspec.envs.deliverybench.view.calls import View, within_reach
 from agentspec.envs.deliverybench.view.choices import Option
 
 MAX_CHOICES = 12
-MAX_WAYS, MAX_OFFERS = 5, 4
+MAX_WAYS, MAX_OFFERS = 5, 3
 """Ways and offers on the first page, which is kept short; the others follow."""
 
 LOW_BATTERY, LOW_ENERGY, THIRSTY = 40.0, 40.0, 50.0
-CAR_FROM_S, CAR_MONEY = 900.0, 30.0
+CAR_FROM_S, CAR_MONEY, CAR_ACTIONS = 900.0, 30.0, 40
 MORE = Option("more choices", "", "more")
 
 
@@ -48,11 +48,13 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
     offered = choices.offers(view)
     care, later = _care(view)
     rent = _car_pays(view)
-    cars = choices.car(view)
-    waits = choices.waits(view)
+    cars = upkeep.car(view)
+    waits = upkeep.waits(view)
+    work, patience = choices.work_here(view)
     first = [
-        *choices.work_here(view),
-        *choices.mounts(view),
+        *work,
+        *patience[:1],
+        *upkeep.mounts(view),
         *(cars if rent else ()),
         *(way for way, _ in ways[:MAX_WAYS]),
         *offered[:MAX_OFFERS],
@@ -61,13 +63,14 @@ def _ranked(view: View) -> tuple[list[Option], list[Option]]:
         waits[0],
     ]
     others = [
+        *patience[1:],
         *(way for way, _ in ways[MAX_WAYS:]),
         *offered[MAX_OFFERS:],
         *later,
         *(way for _, way in ways),
         *cars,
-        *choices.bus(view),
-        *choices.on_foot(view),
+        *upkeep.bus(view),
+        *upkeep.on_foot(view),
         *waits[1:],
     ]
     if calls.hands_full(view) and view["hands_must_be_free"] and view["mode"] != "walk":
@@ -87,6 +90,8 @@ def _car_pays(view: View) -> bool:
     rental = view["nearest"].get("car_rental")
     if view["car"] is not None or rental is None or view["balance"] < CAR_MONEY:
         return False
+    if view["calls_left"] is not None and view["calls_left"] < CAR_ACTIONS:
+        return False
     return bool(view["left_s"] - rental["m"] / view["speed"] >= CAR_FROM_S)
 
 
@@ -97,17 +102,16 @@ def _care(view: View) -> tuple[list[Option], list[Option]]:
     scooter = view["mode"] in ("e-scooter", "drag_scooter")
     low = scooter and view["battery"] <= LOW_BATTERY
     tired = view["energy"] <= LOW_ENERGY
-    for option in choices.using(view):
+    for option in upkeep.using(view):
         wanted = view["energy"] <= THIRSTY if "drink" in option.text else low
         (now if wanted and "into" not in option.text else later).append(option)
-    for group, wanted in ((choices.charging(view), low), (choices.resting(view), tired)):
+    for group, wanted in ((upkeep.charging(view), low), (upkeep.resting(view), tired)):
         (now if wanted else later).extend(group)
     store = view["nearest"].get("store")
     visiting = store is not None and within_reach(view, store["xy"])
-    for option in choices.shopping(view):
+    for option in upkeep.shopping(view):
         drink, pack = option.text == "buy energy drink", option.text == "buy battery pack"
-        needed = (drink and view["energy"] + 50.0 * view["inventory"].get(choices.DRINK, 0) < 100.0) or (pack and low)
-        urgent = needed if visiting else (tired or low) and not view["inventory"]
+        urgent = drink or (pack and low) if visiting else (tired or low) and not view["inventory"]
         (now if urgent else later).append(option)
     return now, later
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from agentspec.policies import Policy, needs_model, weights_digest
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
-from eval.policies import Policy, needs_model, weights_digest
 
 
 def test_parse(tmp_path: Path) -> None:

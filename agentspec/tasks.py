@@ -1,15 +1,41 @@
-"""Sets of tasks: what one table of an evaluation is about."""
+"""What to play: tasks by split, and labelled sets of them.
+
+Shared by training, evaluation and the command line. Splits are ranges of seeds, so that a policy is never tested on
+what it was trained on.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
-from agentspec.registry import REGISTRY, SpecError
+from agentspec.envs.making import short_names
+from agentspec.registry import SpecError
 from agentspec.types import Task
+
+SPLITS = {"train": 0, "validation": 10_000, "test": 20_000}
+"""Split -> its first seed."""
+
+TEST_SEEDS = SPLITS["test"]
+"""Held-out tasks start at this seed; training tasks stay below 10,000 (validation lies between)."""
 
 Tasks = Sequence[Task] | Mapping[str, Sequence[Task]]
 """Tasks to split by environment and options, or labelled sets of them."""
+
+
+def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "train", first: int = 0) -> list[Task]:
+    """`count` tasks of one environment with consecutive seeds, from the `first`-th of the split on.
+
+    Raises:
+        ValueError: an unknown split, or training seeds that reach into the held-out range.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}; expected one of {', '.join(SPLITS)}")
+    base = SPLITS[split] + first
+    if split == "train" and base + count > SPLITS["validation"]:
+        raise ValueError(f"training seeds {base}..{base + count - 1} reach the held-out range; use fewer than 10,000")
+    return [Task(env, base + i, options, split) for i in range(count)]
 
 
 def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
@@ -39,4 +65,4 @@ def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
 
 def environment_name(env: str) -> str:
     """The registered short name of an environment, or its id."""
-    return next((name for name, entry in REGISTRY.entries.get("env", {}).items() if entry.target == env), env)
+    return next((name for name, target in short_names().items() if target == env), env)

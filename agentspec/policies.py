@@ -86,7 +86,7 @@ class Policy:
             ModelNotFoundError: no such model or adapter, with the remedy.
         """
         settings = self.settings()
-        if not self.scripted and settings["backend"] == "local":
+        if not self.scripted and settings["backend"] in ("local", "vision"):
             from agentspec.llm.models import resolve
 
             resolve(settings["model"], self.adapter or None)
