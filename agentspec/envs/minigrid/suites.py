@@ -63,7 +63,9 @@ def layout_of(*, suite: str = "", level: str = "", task: str = "", seed: int = 0
     """
     given = [name for name, value in (("suite", suite), ("level", level), ("task", task)) if value]
     if len(given) != 1:
-        raise ValueError(f"got {' and '.join(given) or 'neither suite, level nor task'}; expected one of suite, level, task")
+        raise ValueError(
+            f"got {' and '.join(given) or 'neither suite, level nor task'}; expected one of suite, level, task"
+        )
     if task:
         named = {layout.name: layout for layout in PAPER}
         if task not in named:

@@ -12,10 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.world import help, moving, services, vehicles, work
 from agentspec.envs.deliverybench.world.clock import ShiftOver, end_episode, pass_time
-from agentspec.envs.deliverybench.world.grammar import Refused
+from agentspec.envs.deliverybench.world.grammar import Refused, understood
 from agentspec.envs.deliverybench.world.recorder import evaluate, report
 from agentspec.envs.deliverybench.world.settlement import Settlement
 from agentspec.envs.deliverybench.world.shift import Shift
@@ -96,7 +95,7 @@ class World(Shift):
         ENDED).
         """
         state = self.state
-        action = text if isinstance(text, Action) else parse_action(text, self.schema)
+        action = text if isinstance(text, Action) else understood(text, self.schema)
         start, delivered = state.tick, len(state.settlements)
         if state.ended:
             return self._outcome(False, "ENDED", "the shift is over", start, delivered, action)
