@@ -79,9 +79,9 @@ class Entry:
         return self.declaration.waived
 
     @property
-    def envs(self) -> tuple[str, ...]:
-        """Environments it is written for; empty: any."""
-        return self.declaration.envs
+    def scripted(self) -> bool:
+        """Whether it plays what an environment's author scripted."""
+        return self.declaration.scripted
 
     @property
     def presets(self) -> dict[str, CallProfile]:
