@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
-from trainers.contents import short_digest
+from trainers.digests import short_digest
 from trainers.credit import FIELDS, Gather
 from trainers.runlog import FORMAT, RunLog
 from trainers.sequences import Row

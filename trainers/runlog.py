@@ -34,10 +34,10 @@ from agentspec.files import (
     write_atomic,
 )
 from agentspec.trajectory import Trajectory, versions
-from trainers.contents import contents, field_digests
+from trainers.digests import field_digests
 from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
 
-FORMAT = 2
+FORMAT = 3
 LOGGED = (METRICS, EVALUATIONS)
 """Files that the seal covers line by line."""
 
@@ -79,10 +79,10 @@ class RunLog:
         lines = [episode.to_json() for episode in episodes]
         blob = "".join(line + "\n" for line in lines)
         write_atomic(self.folder / name, blob)
-        self._written[name] = {"digest": digest(blob), "episodes": [contents(json.loads(line)) for line in lines]}
+        self._written[name] = {"digest": digest(blob), "episodes": [field_digests(json.loads(line)) for line in lines]}
 
     def written(self) -> dict[str, dict[str, Any]]:
-        """File -> its `digest` and that of each of its `episodes` by class of field, since this was last asked."""
+        """File -> its `digest` and that of each of its `episodes` by field, since this was last asked."""
         written, self._written = self._written, {}
         return written
 
