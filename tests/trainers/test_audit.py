@@ -321,7 +321,7 @@ def test_every_field_of_an_episode_has_a_digest() -> None:
     record = json.loads(episode([call(0, [1], [5]), call(1, [1], [6])], rewards=(1.0,)).to_json())
     before = field_digests(record)
     assert differing(before, field_digests({**record, "new": 1})) == ["new"]
-    assert differing(before, field_digests({**record, "metrics": {**record["metrics"], "x": 1}})) == ["metrics.x"]
+    assert differing(before, field_digests({**record, "task": {**record["task"], "x": 1}})) == ["task.x"]
     assert differing(before, field_digests({**record, "calls": record["calls"][:1]}))[0] == "calls"
     # A value that moves from one call to another is an edit too.
     first, second = (c["completions"][0] for c in record["calls"])
