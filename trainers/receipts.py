@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
-from trainers.digests import short_digest
 from trainers.credit import FIELDS, Gather
+from trainers.digests import short_digest
 from trainers.runlog import FORMAT, RunLog
 from trainers.sequences import Row
 

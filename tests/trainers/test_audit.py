@@ -23,8 +23,8 @@ from tests.toy_env import ToyEnv
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import UpdateAudit, _check_advantages, _check_samples, audit, padding_rows
-from trainers.digests import differing, field_digests
 from trainers.credit import CreditRule
+from trainers.digests import differing, field_digests
 from trainers.estimators import ESTIMATORS
 from trainers.provenance import check_completion, check_tokens
 from trainers.receipts import row_digest
@@ -128,7 +128,7 @@ def test_a_run_with_failed_rollouts_passes_and_counts_them(tmp_path: Path) -> No
 # --- edits -----------------------------------------------------------------------------------------------------------
 
 NAMED = {
-    "log-probabilities of all sampled tokens": "trajectories/000001.jsonl, record 1 .*: edited: calls.completions.logprobs",
+    "log-probabilities of all sampled tokens": r"000001.jsonl, record 1 .*: edited: calls.completions.logprobs",
     "log-probability of a forced token": "record 1 .*: edited: calls.completions.logprobs",
     "temperature of a trained call": r"record 1 .*: edited: calls.sampling",
     "top_p of a trained call": r"record 1 .*: edited: calls.sampling",
