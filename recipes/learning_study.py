@@ -82,11 +82,12 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     """Play the matrix and write tables and curves."""
     from agentspec.files import write_atomic
     from agentspec.llm.models import resolve_adapter
+    from agentspec.tasks import make_tasks
     from eval.matrix import Policy, evaluate
     from eval.plots import learning_curves
     from eval.tables import write_report
     from trainers.config import agent_spec
-    from trainers.rollouts import make_tasks
+    from trainers.run_folder import METRICS
     from trainers.runlog import RunLog
 
     config = next(iter(configs.values()))
@@ -108,7 +109,7 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     write_report(rows, out)
     own = {method: c.spec.label for method, c in configs.items()}
     write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
-    logs = {m: [RunLog(f).read("metrics.jsonl") for f in folders.values()] for m, folders in runs.items()}
+    logs = {m: [RunLog(f).read(METRICS) for f in folders.values()] for m, folders in runs.items()}
     learning_curves(logs, out / "curves.png")
     print((out / "study.md").read_text())
 

@@ -1,6 +1,7 @@
 """The configuration of a run: TRL's ``GRPOConfig`` plus what the scaffold adds, in one dataclass.
 
-`trainers.arguments` fills it from a YAML file and from the command line; no other class mirrors it. What cannot work
+`trainers.arguments` fills it from a YAML file and from the command line, and its docstring is what `--help` says of
+each field; no other class mirrors it. What cannot work
 or would not be exact is refused at start, with the reason and the remedy (`trainers.checks`).
 """
 
@@ -18,7 +19,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
 from trainers.checks import check
-from trainers.estimators import ESTIMATORS
+from trainers.credit import CreditRule
 from trainers.sequences import TrainFilter
 
 CHECKPOINTING = (
@@ -49,8 +50,8 @@ class ScaffoldConfig(GRPOConfig):
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in ``gigpo``.
         skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
-        normalize: ``token`` weighs every trained token alike (an episode that trains more tokens counts more);
-            ``rollout`` weighs every rollout alike, so that call-heavy scaffolds do not inflate the loss.
+        normalize: ``token`` gives every trained token the same weight (an episode that trains more tokens counts more);
+            ``rollout`` every rollout, so that call-heavy scaffolds do not inflate the loss.
         overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
             the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
@@ -72,8 +73,8 @@ class ScaffoldConfig(GRPOConfig):
         lora_alpha: scale of the adapter (0: twice the rank).
         lora_targets: module names that carry LoRA (``all-linear`` or a list).
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
-        vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
-            trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
+        vllm_importance_sampling_mode: the importance ratio of a token that was sampled by vLLM's kernels and not the
+            trainer's: clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
             (``token_mask``); both need ``vllm_importance_sampling_correction``.
         vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
             runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
@@ -87,49 +88,46 @@ class ScaffoldConfig(GRPOConfig):
         resume: continue from the last checkpoint in ``output_dir``.
     """
 
-    model: str = field(default="smollm2-135m", metadata={"help": "folder, bundled name or hub id"})
-    adapter: str = field(default="", metadata={"help": "PEFT folder to start from"})
-    actor_adapter: str = field(default="", metadata={"help": "PEFT folder of the frozen actor beside a reflector"})
-    actor_temperature: float = field(default=0.0, metadata={"help": "temperature of the actor beside a reflector"})
-    agent: dict[str, Any] | str | None = field(default=None, metadata={"help": "agent spec: mapping or YAML path"})
-    environment: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the world"})
-    train_tasks: int = field(default=64, metadata={"help": "number of distinct training tasks"})
-    eval_tasks: int = field(default=16, metadata={"help": "number of held-out tasks"})
+    model: str = "smollm2-135m"
+    adapter: str = ""
+    actor_adapter: str = ""
+    actor_temperature: float = 0.0
+    agent: dict[str, Any] | str | None = None
+    environment: dict[str, Any] | str | None = None
+    train_tasks: int = 64
+    eval_tasks: int = 16
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
-    rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
-    estimator: str = field(default="grpo", metadata={"help": ", ".join(ESTIMATORS)})
-    reference: str = field(default="initial", metadata={"help": "initial or base; with beta above 0"})
-    gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
-    gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
-    skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
-    normalize: str = field(default="token", metadata={"help": "token or rollout"})
-    overlong: str = field(default="mask", metadata={"help": "mask, keep or drop"})
+    rewards: dict[str, float] | str | None = None
+    estimator: str = "grpo"
+    reference: str = "initial"
+    gamma: float = 1.0
+    gigpo_weight: float = 1.0
+    skip_zero_variance: bool = False
+    normalize: str = "token"
+    overlong: str = "mask"
     overlong_ends: list[str] = field(default_factory=lambda: ["context"])
     mask_truncated: list[str] = field(default_factory=list)
-    memory_carry: str = field(default="first", metadata={"help": "first or best"})
-    start_memory: str = field(default="", metadata={"help": "memory file or run folder to start from"})
-    retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
-    env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
-    rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    batching: str = field(default="auto", metadata={"help": "auto, continuous or closed"})
-    packing: str = field(default="tree", metadata={"help": "tree or padded"})
-    tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
-    lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
-    lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
+    memory_carry: str = "first"
+    start_memory: str = ""
+    retries: int = 0
+    env_timeout_s: float = 60.0
+    rollout_concurrency: int = 0
+    batching: str = "auto"
+    packing: str = "tree"
+    tokens_per_forward: int = 0
+    lora_r: int = 16
+    lora_alpha: int = 0
     lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
-    lora_layers: int = field(default=0, metadata={"help": "top layers that carry LoRA; 0: all"})
-    # TRL's default weighs whole rows.
-    vllm_importance_sampling_mode: str = field(
-        default="token_truncate", metadata={"help": "token_truncate or token_mask"}
-    )
-    vllm_batch_invariant: bool = field(default=False, metadata={"help": "vLLM's batch-invariant mode"})
-    eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
-    eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
-    validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})
-    validation_specs: list[Any] | str | None = field(default=None, metadata={"help": "further specs to validate under"})
-    plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})
-    resume: bool = field(default=False, metadata={"help": "continue from the last checkpoint in output_dir"})
+    lora_layers: int = 0
+    vllm_importance_sampling_mode: str = "token_truncate"  # TRL's default is a ratio of whole rows
+    vllm_batch_invariant: bool = False
+    eval_specs: list[Any] | str | None = None
+    eval_sampling: dict[str, Any] | str | None = None
+    validation_tasks: int = 16
+    validation_specs: list[Any] | str | None = None
+    plots: bool = True
+    resume: bool = False
 
     def __post_init__(self) -> None:
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
@@ -151,10 +149,14 @@ class ScaffoldConfig(GRPOConfig):
         return agent_spec(self.agent)
 
     @property
+    def credit_rule(self) -> CreditRule:
+        """How episodes are credited."""
+        return CreditRule.from_manifest(vars(self))
+
+    @property
     def train_filter(self) -> TrainFilter:
         """Which completions are trained."""
-        credits: Any = tuple(self.train_credits)
-        return TrainFilter(tuple(self.train_calls), credits, tuple(self.mask_truncated))
+        return self.credit_rule.train
 
     @property
     def world(self) -> tuple[str, dict[str, Any]]:
@@ -192,9 +194,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def reward_set(self) -> RewardSet:
         """The weighted rewards."""
-        if isinstance(self.rewards, str):
-            return RewardSet({self.rewards: 1.0})
-        return RewardSet(self.rewards)
+        return RewardSet(self.credit_rule.rewards)
 
     @property
     def starting_memory(self) -> bytes | None:

@@ -70,7 +70,7 @@ class CreditRule:
         estimator: a name in `trainers.estimators.ESTIMATORS`.
         gamma: discount per step, for estimators that need it.
         gigpo_weight: weight of GiGPO's step advantage.
-        normalize: `token` or `rollout`: whether every trained token weighs alike, or every rollout.
+        normalize: `token` or `rollout`: whether every trained token has the same weight, or every rollout.
         overlong: `mask` (no loss, in the baseline), `keep` or `drop` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong.
         skip_zero_variance: leave groups that the estimator gives no signal out of the loss denominator too.
@@ -90,13 +90,8 @@ class CreditRule:
     rewards: Mapping[str, float] = field(default_factory=lambda: {"earning_delta": 1.0})
 
     @classmethod
-    def from_config(cls, config: Any) -> CreditRule:
-        """The rule of a :class:`~trainers.config.ScaffoldConfig`."""
-        return cls.from_manifest({name: getattr(config, name) for name in FIELDS})
-
-    @classmethod
     def from_manifest(cls, config: Mapping[str, Any]) -> CreditRule:
-        """The rule of a run, from the configuration that its manifest records.
+        """The rule of a run, from the fields of its configuration (in its manifest, say).
 
         Raises:
             ValueError: the record lacks a field that credit depends on.
@@ -214,7 +209,7 @@ def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
 
 
 def per_rollout(rows: Sequence[Row], gather: Gather = list) -> list[Row]:
-    """Scale advantages so that every rollout weighs the same, however many tokens its scaffold trained.
+    """Scale advantages so that every rollout has the same weight, however many tokens its scaffold trained.
 
     The loss divides by all N trained tokens; a rollout with n of them counts n / N. With the factor N / (R n), R
     rollouts with something to train, it counts 1 / R: the mean over rollouts of their mean over tokens.

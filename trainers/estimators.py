@@ -79,7 +79,7 @@ def rloo(returns: Returns) -> list[float]:
 def max_rl(returns: Returns) -> list[float]:
     """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710).
 
-    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved weighs about
+    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved counts about
     1 / p. A group that earned nothing has no signal.
 
     >>> max_rl([1.0, 0.0, 0.0, 0.0])

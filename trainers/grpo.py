@@ -28,7 +28,7 @@ from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
-from trainers.credit import Credited, CreditRule, ScoredEpisode
+from trainers.credit import Credited, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.losses import UpdateSize, loss
@@ -38,7 +38,7 @@ from trainers.receipts import write_receipt
 from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, local_llm, rollout_jobs, starting_states, task_of
 from trainers.round_metrics import episode_metrics, named, round_metrics
-from trainers.run_folder import last_complete_checkpoint
+from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
@@ -70,7 +70,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         args.check()
         prepare_vllm(args)
         self.rewards_used = args.reward_set
-        self.credit_rule = CreditRule.from_config(args)
+        self.credit_rule = args.credit_rule
         self._played: list[ScoredEpisode] = []
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
@@ -277,7 +277,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
                 logs["sampling/logp_difference_max"] = torch.tensor(differences).max().item()
         super().log(logs, start_time)
         if self.accelerator.is_main_process and not summary:
-            step, name = self.state.global_step, "metrics.jsonl" if self.model.training else "evaluations.jsonl"
+            step, name = self.state.global_step, METRICS if self.model.training else EVALUATIONS
             if not self.model.training:
                 self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again
             self.run_log.append(name, {"step": step, **logs})

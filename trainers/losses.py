@@ -38,7 +38,7 @@ class UpdateSize:
 
 
 def trained_tokens(size: UpdateSize) -> int:
-    """Every trained token of the update weighs the same."""
+    """Every trained token of the update has the same weight."""
     return size.tokens
 
 
@@ -139,8 +139,8 @@ LOSSES: dict[str, LossSpec] = {
             "grpo",
             "clipped ratio x advantage: mean over rows of the mean over a row's tokens",
             trl="grpo",
-            depends_on_rows="each row weighs the same, so an episode of three rows weighs three times one of a "
-            "single row",
+            depends_on_rows="each row has the same weight, so an episode of three rows counts three times one of "
+            "a single row",
         ),
         LossSpec(
             "bnpo",
@@ -155,7 +155,7 @@ LOSSES: dict[str, LossSpec] = {
 
 REFUSED = {
     "luspo": "it sums per row, so an episode counts once per row",
-    "sapo": "it averages per row, so an episode of three rows weighs three times one of a single row",
+    "sapo": "it averages per row, so an episode of three rows counts three times one of a single row",
     "vespo": "its weights are products over one row, not over the episode",
 }
 """TRL's losses that are not offered, and why."""

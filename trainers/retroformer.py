@@ -35,8 +35,11 @@ from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
-from trainers.rollouts import collect
+from trainers.rollouts import collect, local_llm
 from trainers.sequences import TrainFilter
+
+ADAPTERS = {PATH: TRAINED, "*": ACTOR}
+"""Which adapter answers: lessons come from the trained one, everything else from the actor's."""
 
 FIRST_TRIALS = "first_trials"
 """Folder of a run that holds the trials that were reflected on, one file per generation round."""
@@ -84,7 +87,8 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         **kwargs: Any,
     ) -> None:
         check_retroformer(args)
-        super().__init__(model, args, make_llm=make_llm or partial(routed_llm, batching=args.batching), **kwargs)
+        llm = partial(local_llm, batching=args.batching, adapters=ADAPTERS)
+        super().__init__(model, args, make_llm=make_llm or llm, **kwargs)
         self._first_trials: list[ScoredEpisode] = []
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: Any = None) -> None:
@@ -168,10 +172,3 @@ def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
     params = {"temperature": spec.sampling.temperature, **spec.reflection.params}
     sampling = replace(spec.sampling, temperature=config.actor_temperature)
     return replace(spec, reflection=ModuleSpec(spec.reflection.name, params), sampling=sampling)
-
-
-def routed_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
-    """The local backend: lessons come from the trained adapter, everything else from the actor's."""
-    from agentspec.llm.local import LocalLLM
-
-    return LocalLLM(model, tokenizer, name="policy", adapters={PATH: TRAINED, "*": ACTOR}, batching=batching)

@@ -165,8 +165,3 @@ def seal_of(folder: Path) -> dict[str, Any]:
         "manifest": file_digest(folder / MANIFEST) if (folder / MANIFEST).is_file() else "",
         "logs": {name: lines for name, lines in logs.items() if lines},
     }
-
-
-def paths_called(trajectories: Sequence[Trajectory]) -> set[str]:
-    """`module/purpose (credit)` of everything that the episodes asked the model."""
-    return {f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions}

@@ -42,7 +42,7 @@ def test_one_rule_from_a_configuration_and_from_its_record(tmp_path: Path) -> No
         mask_truncated=["memory.summary"],
         rewards={"env": 2.0},
     )
-    rule = CreditRule.from_config(given)
+    rule = given.credit_rule
     assert rule == CreditRule.from_manifest(given.to_dict())
     assert rule == CreditRule(
         2,

@@ -2,7 +2,7 @@
 
 `LocalLLM` turns requests into token rows (`agentspec.llm.chat`), gathers those of all live episodes into one batch
 (`agentspec.llm.batching`) and runs it without padding on cached prefixes (`agentspec.llm.local.engine`). The model is
-never moved, cast or left changed, so a trainer can hand over the model it optimises; its weights may change between
+never moved, cast or left changed, so a trainer can give the model it optimises; its weights may change between
 batches (the caches notice in-place updates; call `LocalLLM.invalidate` after any other change).
 """
 
