@@ -3,8 +3,8 @@
     python -m recipes.learning_study --configs recipes/configs/study_grpo.yaml recipes/configs/study_supo.yaml \\
         --seeds 0 1 2 --out runs/study
 
-Every run is a process of its own (``OUT/NAME-sSEED``) and goes on where it stopped; so does the evaluation. What comes
-out: ``study.md`` (gains per training seed and over all of them), ``results.md`` (the whole matrix), ``curves.png``.
+Every run is a process of its own (`OUT/NAME-sSEED`) and goes on where it stopped; so does the evaluation. What comes
+out: `study.md` (gains per training seed and over all of them), `results.md` (the whole matrix), `curves.png`.
 All configs must name the same model, warm start and world: then one starting policy is the baseline of all.
 """
 

@@ -1,4 +1,4 @@
-"""The configuration of a run: TRL's ``GRPOConfig`` plus what the scaffold adds, in one dataclass.
+"""The configuration of a run: TRL's `GRPOConfig` plus what the scaffold adds, in one dataclass.
 
 `trainers.arguments` fills it from a YAML file and from the command line, and its docstring is what `--help` says of
 each field; no other class mirrors it. What cannot work
@@ -30,62 +30,62 @@ CHECKPOINTING = (
 
 @dataclass
 class ScaffoldConfig(GRPOConfig):
-    """``trl.GRPOConfig`` and what training inside a scaffold needs.
+    """`trl.GRPOConfig` and what training inside a scaffold needs.
 
     Args:
-        model: what :func:`agentspec.llm.models.resolve` understands: a folder, ``smollm2-135m`` or a hub id.
+        model: what `agentspec.llm.models.resolve` understands: a folder, `smollm2-135m` or a hub id.
         adapter: PEFT folder to start from (a warm start), or empty.
         actor_adapter: training a reflector: PEFT folder of the frozen actor, or empty (the base model acts).
         actor_temperature: training a reflector: sampling temperature of the actor; lessons have the agent's.
         agent: the agent spec: a mapping, or a path to a YAML file.
-        environment: ``{name: ..., options: {...}}``: the world and its ``gymnasium.make`` arguments.
-        train_tasks: number of distinct training tasks (seeds ``0 .. train_tasks - 1``).
-        eval_tasks: number of held-out tasks (seeds ``20000 ..``) for evaluation after training.
-        train_calls: patterns over ``module/purpose`` of the calls that are trained.
-        train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
-        rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
-        reference: with ``beta`` above 0, what the policy is kept near: the ``initial`` policy, as training began (its
-            adapter included), or the ``base`` model without any adapter.
-        estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
+        environment: `{name: ..., options: {...}}`: the world and its `gymnasium.make` arguments.
+        train_tasks: number of distinct training tasks (seeds `0 .. train_tasks - 1`).
+        eval_tasks: number of held-out tasks (seeds `20000 ..`) for evaluation after training.
+        train_calls: patterns over `module/purpose` of the calls that are trained.
+        train_credits: credits that are trained (`executed`, `explored`, `aux`).
+        rewards: weight by registered reward; default `{earning_delta: 1.0}`.
+        reference: with `beta` above 0, what the policy is kept near: the `initial` policy, as training began (its
+            adapter included), or the `base` model without any adapter.
+        estimator: how returns become advantages: a name in `trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
-        gigpo_weight: weight of the step advantage in ``gigpo``.
+        gigpo_weight: weight of the step advantage in `gigpo`.
         skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
-        normalize: ``token`` gives every trained token the same weight (an episode that trains more tokens counts more);
-            ``rollout`` every rollout, so that call-heavy scaffolds do not inflate the loss.
-        overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
-            the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
-        overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
+        normalize: `token` gives every trained token the same weight (an episode that trains more tokens counts more);
+            `rollout` every rollout, so that call-heavy scaffolds do not inflate the loss.
+        overlong: what happens to episodes that ended for a reason in `overlong_ends`: `mask` (zero loss, still in
+            the baseline: SUPO's default), `keep` or `drop` (neither loss nor baseline).
+        overlong_ends: ends that make an episode overlong: `context`, `budget`, `max_steps`, `truncated`.
         mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
-        memory_carry: with ``scope: run``, whose memory a task carries on: that of its ``first`` rollout in a round, or
-            of its ``best``. All rollouts of a task start from the same memory; tasks share none.
-        start_memory: with ``scope: run``, a memory file or the folder of a run that wrote one (`memory.json`), to start
+        memory_carry: with `scope: run`, whose memory a task carries on: that of its `first` rollout in a round, or
+            of its `best`. All rollouts of a task start from the same memory; tasks share none.
+        start_memory: with `scope: run`, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: ``continuous`` at any time, ``closed``
-            never, so that runs repeat on every device; ``auto`` is ``continuous`` where that repeats to the last bit
-            (a CPU in float32), else ``closed``, with a warning (`agentspec.llm.batching`).
-        packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
+        batching: when the local backend takes requests into a running batch: `continuous` at any time, `closed`
+            never, so that runs repeat on every device; `auto` is `continuous` where that repeats to the last bit
+            (a CPU in float32), else `closed`, with a warning (`agentspec.llm.batching`).
+        packing: `tree` computes shared prefixes of the update once, `padded` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
         lora_r: rank of a new LoRA adapter; 0 trains all weights.
         lora_alpha: scale of the adapter (0: twice the rank).
-        lora_targets: module names that carry LoRA (``all-linear`` or a list).
+        lora_targets: module names that carry LoRA (`all-linear` or a list).
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
         vllm_importance_sampling_mode: the importance ratio of a token that was sampled by vLLM's kernels and not the
-            trainer's: clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
-            (``token_mask``); both need ``vllm_importance_sampling_correction``.
+            trainer's: clipped at `vllm_importance_sampling_clip_max` (`token_truncate`) or 0 beyond it
+            (`token_mask`); both need `vllm_importance_sampling_correction`.
         vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
             runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
-        validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
-            with ``eval_strategy: steps``; the best checkpoint by ``metric_for_best_model`` (default ``reward``, the
-            mean under the training scaffold) is kept, and is the result with ``load_best_model_at_end``.
+        validation_tasks: number of held-out tasks (seeds `10000 ..`) that are played every `eval_steps` updates
+            with `eval_strategy: steps`; the best checkpoint by `metric_for_best_model` (default `reward`, the
+            mean under the training scaffold) is kept, and is the result with `load_best_model_at_end`.
         validation_specs: further agent specs to validate under, beside the training scaffold.
         plots: write the reward curve as PNG when training ends.
-        resume: continue from the last checkpoint in ``output_dir``.
+        resume: continue from the last checkpoint in `output_dir`.
     """
 
     model: str = "smollm2-135m"
@@ -163,7 +163,7 @@ class ScaffoldConfig(GRPOConfig):
         """Name and options of the environment.
 
         Raises:
-            SpecError: not of the form ``{name: ..., options: {...}}``.
+            SpecError: not of the form `{name: ..., options: {...}}`.
         """
         value = self.environment or "deliverybench"
         given: dict[str, Any] = {"name": value} if isinstance(value, str) else value
@@ -198,7 +198,7 @@ class ScaffoldConfig(GRPOConfig):
 
     @property
     def starting_memory(self) -> bytes | None:
-        """The bank of memories that the run starts from (`agentspec.carry`), or ``None`` where it starts from nothing.
+        """The bank of memories that the run starts from (`agentspec.carry`), or `None` where it starts from nothing.
 
         Raises:
             SpecError: no such file, or one of other modules than the agent's.

@@ -1,12 +1,12 @@
 """Credit: from the scored episodes of an update to rows with advantages.
 
-A :class:`CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
+A `CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
 gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
 scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
 became changes nobody's baseline, and all of them share its advantage.
 
 A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
-made after the last step earns nothing in its episode and has no row (:mod:`trainers.sequences`).
+made after the last step earns nothing in its episode and has no row (`trainers.sequences`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Expert episodes -> a supervised warm start, in the layout that the policy will meet.
 
 Few tokens of a row are the expert's: a dozen short actions among thousands of tokens of prompts and observations. So
-TRL's ``SFTTrainer`` gets its loss from the packed forward, which computes logits only where a token is trained.
+TRL's `SFTTrainer` gets its loss from the packed forward, which computes logits only where a token is trained.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def demonstrate(
     expert: str = "rule_based",
     make_env: MakeEnv = make_env,
 ) -> Demonstrations:
-    """Play ``tasks`` with the expert, then again inside ``spec`` with the expert's actions as answers.
+    """Play `tasks` with the expert, then again inside `spec` with the expert's actions as answers.
 
     The second pass writes the prompts of the scaffold; the environment is deterministic, so both passes agree.
 
@@ -66,7 +66,7 @@ def demonstrate(
 
 
 class DemonstrationTrainer(SFTTrainer):
-    """``SFTTrainer`` whose forward is packed; the loss is the same mean negative log-likelihood of labelled tokens."""
+    """`SFTTrainer` whose forward is packed; the loss is the same mean negative log-likelihood of labelled tokens."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Estimators: how the returns of a group become advantages. One function and one row of :data:`ESTIMATORS` adds one.
+"""Estimators: how the returns of a group become advantages. One function and one row of `ESTIMATORS` adds one.
 
 An estimator sees the scorable rollouts of one group and nothing else: no failed rollout, no token, no sequence, so
 that none of these can change a baseline. One *per episode* gets their returns and gives one number each; one *per step*
@@ -175,7 +175,7 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
 
 
 def estimator(name: str) -> EstimatorSpec:
-    """The row of ``name``.
+    """The row of `name`.
 
     Raises:
         SpecError: no such estimator.

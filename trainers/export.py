@@ -2,7 +2,7 @@
 
 What training leaves is scattered: weights here or in the last checkpoint, optimiser states beside them, the scaffold in
 the run's manifest. An export holds what is needed to act again and nothing else: the PEFT adapter (or the merged
-model), the tokenizer with its chat template, and ``agentspec.json``, which says what the adapter belongs to and which
+model), the tokenizer with its chat template, and `agentspec.json`, which says what the adapter belongs to and which
 scaffold it was trained in. Weights are safetensors throughout; nothing is ever unpickled.
 """
 
@@ -52,19 +52,19 @@ class Trained:
 
 
 def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
-    """Write the trained policy of ``run`` to ``to``, whole or not at all.
+    """Write the trained policy of `run` to `to`, whole or not at all.
 
     Args:
         run: output folder of training: its final model, else its last complete checkpoint.
         to: folder to write; must not exist, or be empty.
         merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
-            ``transformers`` reads the result. A run that trained all weights is a whole model either way.
+            `transformers` reads the result. A run that trained all weights is a whole model either way.
 
     Returns:
-        ``to``.
+        `to`.
 
     Raises:
-        SpecError: there are no weights in ``run``, or ``to`` holds something.
+        SpecError: there are no weights in `run`, or `to` holds something.
         ModelNotFoundError: the base model that an adapter needs cannot be found.
     """
     run, to = Path(run), Path(to)
@@ -225,8 +225,8 @@ def reward_summary(rows: Iterable[dict[str, Any]], *, key: str = "reward", windo
     """The reward curve in a few numbers.
 
     Returns:
-        ``steps`` (last logged step), ``first`` and ``last`` (means of the first and last ``window`` logged values),
-        ``best`` and ``best_step``; empty without a logged reward.
+        `steps` (last logged step), `first` and `last` (means of the first and last `window` logged values),
+        `best` and `best_step`; empty without a logged reward.
     """
     points = [(row["step"], float(row[key])) for row in rows if row.get(key) is not None and "step" in row]
     if not points:

@@ -2,7 +2,7 @@
 
 TRL keeps what it is good at: configuration, the clipped losses, PEFT, accelerate, logs, checkpoints. This subclass
 replaces where micro-batches come from: for each generation round it plays one episode per task row, scores it once,
-credits whole groups (:mod:`trainers.credit`), partitions all sequences of all episodes into a fixed number of
+credits whole groups (`trainers.credit`), partitions all sequences of all episodes into a fixed number of
 micro-batches, and counts the denominator over what is trained.
 """
 
@@ -50,12 +50,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
-        model: the policy, already loaded (a ``PeftModel`` or any causal LM).
-        args: see :class:`~trainers.config.ScaffoldConfig`.
-        train_dataset: rows of :func:`~trainers.rollouts.task_rows`.
+        model: the policy, already loaded (a `PeftModel` or any causal LM).
+        args: see `trainers.config.ScaffoldConfig`.
+        train_dataset: rows of `trainers.rollouts.task_rows`.
         make_llm: model, tokenizer -> the backend that samples from the live policy (default: the local one).
         make_env: task -> environment.
-        kwargs: passed on to ``trl.GRPOTrainer``.
+        kwargs: passed on to `trl.GRPOTrainer`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
 
-        ``resume_from_checkpoint=True`` means the last complete checkpoint in ``output_dir``, if there is one.
+        `resume_from_checkpoint=True` means the last complete checkpoint in `output_dir`, if there is one.
         """
         if resume_from_checkpoint is True:
             resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
@@ -142,7 +142,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
             return self._play(jobs)
 
     def _runner(self, spec: AgentSpec) -> Runner:
-        """Runs episodes of ``spec`` with the policy as it is."""
+        """Runs episodes of `spec` with the policy as it is."""
         return Runner(
             spec,
             self.llm,
@@ -154,7 +154,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         )
 
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
-        """One episode per job, in order, those that failed among them; ``spec``: another than the training scaffold."""
+        """One episode per job, in order, those that failed among them; `spec`: another than the training scaffold."""
         runner = self._runner(spec or self.args.spec)
         return collect(runner, jobs, self.rewards_used, retries=self.args.retries)
 
@@ -181,9 +181,9 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         check_trained(self.last_episodes, self.credit_rule.train, gather_object)
 
     def _carried_memory(self) -> bytes | None:
-        """With ``scope: run``: the bank of memories that the next round starts from, the same on every rank.
+        """With `scope: run`: the bank of memories that the next round starts from, the same on every rank.
 
-        Each task carries the memory of one of its own rollouts. The main process keeps the bank as ``memory.json``.
+        Each task carries the memory of one of its own rollouts. The main process keeps the bank as `memory.json`.
         """
         if self.args.spec.scope != "run":
             return None
@@ -285,13 +285,13 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
     def evaluate(
         self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
     ) -> dict[str, float]:
-        """Play the validation tasks with the policy as it is; see :mod:`trainers.validation`.
+        """Play the validation tasks with the policy as it is; see `trainers.validation`.
 
         The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
         had been evaluated.
 
         Args:
-            eval_dataset: rows of :func:`~trainers.rollouts.task_rows`; default: the trainer's ``eval_dataset``.
+            eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
             ignore_keys: not used (part of the base class's signature).
             metric_key_prefix: stands before every metric's name.
         """

@@ -1,7 +1,7 @@
-"""Losses: the objective of a token and what the sum is divided by. One function and one row of :data:`LOSSES` adds one.
+"""Losses: the objective of a token and what the sum is divided by. One function and one row of `LOSSES` adds one.
 
 TRL's losses are TRL's code: such a row names the `loss_type` that computes it. A row of ours brings an `objective`.
-Either way the row says what divides the sum over an update (:class:`UpdateSize`), which tokens it clips, which settings
+Either way the row says what divides the sum over an update (`UpdateSize`), which tokens it clips, which settings
 it reads and how, if at all, it depends on the way episodes split into rows; the trainer, the configuration check, the
 clip shares, the audit and the table in the docs follow from it.
 """
@@ -88,7 +88,7 @@ class LossSpec:
         name: as in `loss_type: NAME`.
         summary: the loss of an update, in one line.
         trl: TRL's `loss_type` whose code computes it; empty where `objective` does.
-        objective: ours: see :data:`Objective`.
+        objective: ours: see `Objective`.
         denominator: what the sum over the update is divided by, where it is one number.
         clipped: which tokens lose their gradient to clipping; arguments as of `objective`.
         uses: settings of the configuration that it reads.

@@ -87,7 +87,7 @@ def receipt_record(
         played: id and return of every episode of the round.
         rows: of all ranks, as of `receipt_rows`.
         padding_rows: rows that fill up micro-batches and train nothing.
-        denominator: what the loss is divided by (:mod:`trainers.losses`).
+        denominator: what the loss is divided by (`trainers.losses`).
         settings: as of `settings`.
     """
     return {

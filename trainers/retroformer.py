@@ -6,11 +6,11 @@ of a task, k lessons about it, and k further trials, each played with one of the
 
 1. each task of the round is played once, from an empty memory;
 2. if that trial failed, k episodes start from the memory it left. Each begins by writing its own lesson
-   (``when: start``) and is paid ``G(this trial) - G(failed trial)`` (reward ``reflection_gain``);
+   (`when: start`) and is paid `G(this trial) - G(failed trial)` (reward `reflection_gain`);
 3. if it did not fail, there is nothing to learn: the trial stands in for the k episodes, without rows or gradient.
 
-The actor is greedy (``actor_temperature: 0``), so that what changes between trials is owed to the lesson; a lesson is
-sampled at the agent's temperature. Everything else is :class:`~trainers.grpo.ScaffoldGRPOTrainer`. The paper trains its
+The actor is greedy (`actor_temperature: 0`), so that what changes between trials is owed to the lesson; a lesson is
+sampled at the agent's temperature. Everything else is `trainers.grpo.ScaffoldGRPOTrainer`. The paper trains its
 reflector with a reward model and PPO on stored lessons; here the group is the baseline, and lessons are always fresh.
 """
 
@@ -46,9 +46,9 @@ FIRST_TRIALS = "first_trials"
 
 
 def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
-    """Make ``config`` train the reflector, and nothing else.
+    """Make `config` train the reflector, and nothing else.
 
-    The agent's reflection becomes ``retroformer`` with ``when: start`` and its scope ``run``; the lessons are the
+    The agent's reflection becomes `retroformer` with `when: start` and its scope `run`; the lessons are the
     trained calls; the reward, unless one is given, is the change of return.
 
     Raises:
@@ -72,10 +72,10 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
     """GRPO for the reflector of a frozen actor.
 
     Args:
-        model: a PEFT model as of :func:`~trainers.policy.load_actor_and_reflector`.
-        args: as of :func:`as_retroformer`.
+        model: a PEFT model as of `trainers.policy.load_actor_and_reflector`.
+        args: as of `as_retroformer`.
         make_llm: model, tokenizer -> a backend that gives each call its adapter.
-        kwargs: as of :class:`~trainers.grpo.ScaffoldGRPOTrainer`.
+        kwargs: as of `trainers.grpo.ScaffoldGRPOTrainer`.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ def has_lesson(trajectory: Trajectory) -> bool:
 
 
 def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
-    """The scaffold with the actor at ``actor_temperature`` and lessons at the agent's own temperature."""
+    """The scaffold with the actor at `actor_temperature` and lessons at the agent's own temperature."""
     spec = config.spec
     params = {"temperature": spec.sampling.temperature, **spec.reflection.params}
     sampling = replace(spec.sampling, temperature=config.actor_temperature)

@@ -1,7 +1,7 @@
 """G rollouts of each task, run through the agent, all at once.
 
 The trainer gives its generation batch (task rows, each repeated G times by TRL's sampler); what comes back is one
-:class:`~trainers.credit.ScoredEpisode` per row, in order: the trajectory and what it earned, computed once. A rollout
+`trainers.credit.ScoredEpisode` per row, in order: the trajectory and what it earned, computed once. A rollout
 that failed is among them, without a score.
 """
 
@@ -55,7 +55,7 @@ def rollout_jobs(
         round: number of the generation round; another round samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
-        memory: the run's `agentspec.carry.MemoryBank` as bytes (with ``scope: run``): all rollouts of a task start
+        memory: the run's `agentspec.carry.MemoryBank` as bytes (with `scope: run`): all rollouts of a task start
             from that task's state.
     """
     run_seed = derive_seed(seed, round)
@@ -71,7 +71,7 @@ def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool
 
     Args:
         tasks: in order.
-        memory: a `MemoryBank` as bytes; ``None``: nothing is carried.
+        memory: a `MemoryBank` as bytes; `None`: nothing is carried.
         unseen: tasks that the run does not train on: without a state of their own they start from the latest.
     """
     if memory is None:

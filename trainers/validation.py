@@ -19,7 +19,7 @@ from trainers.credit import ScoredEpisode
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
-    """Scaffold by prefix of its metrics: the training scaffold has none, others ``LABEL/``; greedy by default."""
+    """Scaffold by prefix of its metrics: the training scaffold has none, others `LABEL/`; greedy by default."""
     training = config.spec
     scaffolds = {"": training} | {f"{s.label}/": s for s in config.other_specs if s != training}
     changes = config.evaluation_sampling
@@ -38,15 +38,15 @@ def validate(
     """Mean figures per scaffold over the same tasks.
 
     Args:
-        scaffolds: by prefix, as of :func:`validation_scaffolds`.
+        scaffolds: by prefix, as of `validation_scaffolds`.
         jobs: all of them; rank r plays those at r, r + ranks, ...
         play: scaffold, jobs -> episodes, scored by the training reward.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
-        ``PREFIXreward`` (the training reward per episode), the figures that the environment declares and the scaffold's
-        (`agentspec.metrics.figures`), and ``PREFIXunscorable``, the share of episodes that failed; means leave these
-        out. ``reward`` is NaN if all failed.
+        `PREFIXreward` (the training reward per episode), the figures that the environment declares and the scaffold's
+        (`agentspec.metrics.figures`), and `PREFIXunscorable`, the share of episodes that failed; means leave these
+        out. `reward` is NaN if all failed.
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
