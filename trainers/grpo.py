@@ -34,19 +34,19 @@ from trainers.finite import FiniteGuard, without_dropout
 from trainers.losses import UpdateSize, loss
 from trainers.micro_batches import ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
-from trainers.receipts import write_receipt
+from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
-from trainers.rollouts import collect, local_llm, rollout_jobs, starting_states, task_of
+from trainers.rollouts import collect, local_llm, rollout_jobs
 from trainers.round_metrics import episode_metrics, named, round_metrics
 from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree import enable_tree
-from trainers.validation import validate, validation_scaffolds
+from trainers.validation import Validation
 from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -254,18 +254,19 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
-        write_receipt(
-            self.run_log,
-            gather_object,
-            main=self.accelerator.is_main_process,
-            rank=self.accelerator.process_index,
+        rank, played = self.accelerator.process_index, [(e.trajectory.episode, e.total) for e in self._played]
+        padding = [sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])]
+        files = dict(gather_object(list(self.run_log.written().items())))
+        record = receipt_record(
             round=self._round,
-            played=[(e.trajectory.episode, e.total) for e in self._played],
-            rows=rows,
-            padding_rows=sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS]),
+            played=gather_object(played),
+            rows=gather_object(receipt_rows(rows, rank * len(played))),
+            padding_rows=sum(gather_object(padding)),
             denominator=int(self._buffered_inputs[0]["num_items_in_batch"]),
-            config=self.args.to_dict(),
+            settings=settings(self.args.to_dict()),
         )
+        if self.accelerator.is_main_process:
+            self.run_log.receipt(record, files)
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
@@ -281,37 +282,3 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
             if not self.model.training:
                 self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again
             self.run_log.append(name, {"step": step, **logs})
-
-    def evaluate(
-        self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
-    ) -> dict[str, float]:
-        """Play the validation tasks with the policy as it is; see `trainers.validation`.
-
-        The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
-        had been evaluated.
-
-        Args:
-            eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
-            ignore_keys: not used (part of the base class's signature).
-            metric_key_prefix: stands before every metric's name.
-        """
-        rows = self.eval_dataset if eval_dataset is None else eval_dataset
-        tasks = [task_of(row) for row in rows]
-        states = starting_states(tasks, self._memory, unseen=True)
-        training = self.model.training
-        self.model.eval()
-        with self._current_weights():
-            metrics = validate(
-                validation_scaffolds(self.args),
-                [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
-                lambda spec, jobs: self._play(jobs, spec),
-                rank=self.accelerator.process_index,
-                ranks=self.accelerator.num_processes,
-                gather=gather_object,
-            )
-        metrics = {f"{metric_key_prefix}_{name}": value for name, value in metrics.items()}
-        self.log(dict(metrics))
-        control = self.callback_handler.on_evaluate(self.args, self.state, self.control, metrics)  # type: ignore[has-type]
-        self.control = control
-        self.model.train(training)
-        return metrics
