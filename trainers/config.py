@@ -206,11 +206,7 @@ class ScaffoldConfig(GRPOConfig):
         return start_bank(self.start_memory, self.spec).dump() if self.start_memory else None
 
     def check(self) -> None:
-        """Refuse what cannot work, would not be exact, or would change nothing (`trainers.checks`).
-
-        Raises:
-            SpecError: what was given, why it cannot work, what to do.
-        """
+        """See `trainers.checks.check`."""
         check(self)
 
 

@@ -63,17 +63,10 @@ class Credited:
 
 @dataclass(frozen=True)
 class CreditRule:
-    """How episodes are credited.
+    """How episodes are credited; what is not told here is told of the same field of `trainers.config.ScaffoldConfig`.
 
     Args:
         group: rollouts per task; episodes come in whole groups.
-        estimator: a name in `trainers.estimators.ESTIMATORS`.
-        gamma: discount per step, for estimators that need it.
-        gigpo_weight: weight of GiGPO's step advantage.
-        normalize: `token` or `rollout`: whether every trained token has the same weight, or every rollout.
-        overlong: `mask` (no loss, in the baseline), `keep` or `drop` (neither loss nor baseline).
-        overlong_ends: ends that make an episode overlong.
-        skip_zero_variance: leave groups that the estimator gives no signal out of the loss denominator too.
         train: which completions are trained.
         rewards: reward name -> weight.
     """

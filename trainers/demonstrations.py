@@ -22,7 +22,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence, TrainFilter, build_sequences
-from trainers.tree import enable_tree
+from trainers.tree.model import enable_tree
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,7 @@ def demonstrate(
     jobs = [Job(task) for task in tasks]
     scripted = replace(spec, reasoning=ModuleSpec(expert), memory=ModuleSpec("none"), reflection=ModuleSpec("none"))
     played = Runner(scripted, make_env=make_env).run(jobs)
-    names = [f"{job.task.key}-{job.rollout}-{job.seed:x}" for job in jobs]
-    actions = {n: [t.action_text for t in episode.transitions] for n, episode in zip(names, played, strict=True)}
+    actions = {episode.episode: [t.action_text for t in episode.transitions] for episode in played}
     episodes = Runner(spec, DemonstrationLLM(tokenizer, actions), make_env=make_env).run(jobs)
     failed = [t.error for t in (*played, *episodes) if not t.scorable]
     if failed:

@@ -18,7 +18,8 @@ from agentspec.tokens import shared_prefix
 from trainers.logprobs import sampled_logprobs
 from trainers.micro_batches import padding_row
 from trainers.sequences import Row, TokenSequence
-from trainers.tree import build_tree, packed_inputs, wanted_tokens
+from trainers.tree.model import packed_inputs, wanted_tokens
+from trainers.tree.trie import build_tree
 
 Packing = Literal["tree", "padded"]
 Places = Sequence[tuple[int, int]]
@@ -38,7 +39,7 @@ def rows_logprobs(
 
     Args:
         skip_backward: compute rows without a policy gradient without a graph.
-        packing: `padded` rows, or a prefix `tree` (the model must know it: `trainers.tree.enable_tree`).
+        packing: `padded` rows, or a prefix `tree` (the model must know it: `trainers.tree.model.enable_tree`).
         tokens_per_forward: token budget of a forward (0: no bound for a tree, one row for padded ones). If one forward
             does not hold the micro-batch, forwards are recomputed in the backward pass, so that activations of one
             chunk at a time are kept.

@@ -41,7 +41,7 @@ from trainers.round_metrics import episode_metrics, named, round_metrics
 from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
-from trainers.tree import enable_tree
+from trainers.tree.model import enable_tree
 from trainers.validation import Validation
 from trainers.vllm import prepare_vllm, vllm_round
 
