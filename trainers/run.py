@@ -53,21 +53,7 @@ def train(
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None
     model, tokenizer = load(config)
-    name, options = config.world
-    tasks = make_tasks(name, options, config.train_tasks)
-    held_out = make_tasks(name, options, config.validation_tasks, split="validation") if config.validates else []
-    trainer = trainer_class(
-        model,
-        config,
-        train_dataset=Dataset.from_list(task_rows(tasks)),
-        eval_dataset=Dataset.from_list(task_rows(held_out)) if held_out else None,
-        processing_class=tokenizer,
-        callbacks=list(callbacks),
-    )
-    if trainer.pop_callback(ProgressCallback):
-        trainer.add_callback(Bar)
-    trainer.remove_callback(PrinterCallback)
-    trainer.add_callback(TerminalReport(lambda: trainer.last_episodes))
+    trainer = _trainer(trainer_class, config, model, tokenizer, callbacks)
     main = trainer.accelerator.is_main_process
     for line in (*(f"note: {n}" for n in notes(config)), *([f"resuming from {last}"] if last else [])):
         if main:
@@ -80,6 +66,28 @@ def train(
                 print(f"\n{_how_to_continue(folder)}", file=sys.stderr)
             raise
         trainer.save_model(str(folder))
+    return trainer
+
+
+def _trainer(
+    kind: type[ScaffoldGRPOTrainer], config: ScaffoldConfig, model: Any, tokenizer: Any, callbacks: Sequence[Any]
+) -> ScaffoldGRPOTrainer:
+    """The trainer, with its tasks and with our reports in the place of the libraries'."""
+    name, options = config.world
+    tasks = make_tasks(name, options, config.train_tasks)
+    held_out = make_tasks(name, options, config.validation_tasks, split="validation") if config.validates else []
+    trainer = kind(
+        model,
+        config,
+        train_dataset=Dataset.from_list(task_rows(tasks)),
+        eval_dataset=Dataset.from_list(task_rows(held_out)) if held_out else None,
+        processing_class=tokenizer,
+        callbacks=list(callbacks),
+    )
+    if trainer.pop_callback(ProgressCallback):
+        trainer.add_callback(Bar)
+    trainer.remove_callback(PrinterCallback)
+    trainer.add_callback(TerminalReport(lambda: trainer.last_episodes))
     return trainer
 
 
