@@ -135,8 +135,3 @@ class State:
     def carrying(self) -> list[int]:
         """Ids of the orders picked up and not yet delivered."""
         return [number for number, order in self.orders.items() if order.picked is not None]
-
-    @property
-    def towing(self) -> bool:
-        """Whether the courier drags the scooter."""
-        return self.mode == "drag_scooter"
