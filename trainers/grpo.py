@@ -32,7 +32,7 @@ from trainers.credit import Credited, CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.losses import UpdateSize, loss
-from trainers.micro_batches import ROWS, collate, padding_row, partition
+from trainers.micro_batches import PADDED, ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
 from trainers.receipts import write_receipt
 from trainers.resume import ExactResume, restore_finished
@@ -228,10 +228,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
+        counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
+        padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []
         for rows in micro_batches:
             batch: dict[str, Any] = collate(rows, self._tokenizer.pad_token_id, device)
-            batch |= {ROWS: rows, "num_items_in_batch": denominator}
+            batch |= {ROWS: rows, "num_items_in_batch": denominator, PADDED: padded}
             if self._off_policy:
                 batch["old_per_token_logps"] = batch["sampled_logprobs"]
             if self.beta != 0.0:
