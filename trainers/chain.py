@@ -183,6 +183,10 @@ def check_end(
         name = path.relative_to(folder).as_posix()
         if name not in named and (sealed or not int(path.name[:6]) > last):
             problems.append(f"{name}: no receipt names it")
+    known = {p.name for p in round_files(folder)}
+    for path in sorted((folder / TRAJECTORIES).glob("*")):
+        if path.name not in known and not path.name.startswith("."):
+            problems.append(f"{TRAJECTORIES}/{path.name}: no receipt names it, and no round has a file of that name")
     reached = max((number + steps for number, _, steps in receipts), default=0)
     steps = {METRICS: max((_step(line) for _, line in whole_lines(folder / METRICS)), default=0)}
     steps |= {p.name: int(p.name.removeprefix(f"{CHECKPOINT}-")) for p in checkpoints(folder)}
@@ -219,7 +223,8 @@ def _check_seal(folder: Path, head: str) -> tuple[list[str], list[str]]:
         return [f"{SEAL} is no seal"], []
     for name in sorted({*seal, *expected}):
         if seal.get(name) != expected.get(name):
-            problems += _log_problems(seal.get(name), expected[name]) if name == "logs" else [_SEALED.get(name, name)]
+            told = {"logs": _log_problems, "sizes": _size_problems}.get(name)
+            problems += told(seal.get(name), expected[name]) if told else [_SEALED.get(name, name)]
     if not problems and blob != (json.dumps(expected, indent=1, sort_keys=True) + "\n").encode():
         problems.append(f"{SEAL}: its bytes were edited")
     if head and digest(blob) != head:
@@ -233,6 +238,16 @@ _SEALED = {
     "manifest": f"{MANIFEST} is not the one that {SEAL} names (`manifest`)",
     "format": f"{SEAL}: `format` was edited",
 }
+
+
+def _size_problems(sealed: Any, found: Mapping[str, int]) -> list[str]:
+    if not isinstance(sealed, Mapping):
+        return [f"{SEAL}: `sizes` was edited"]
+    return [
+        f"{name} has {found.get(name, 0)} bytes, {SEAL} says {sealed.get(name, 0)} (`sizes`)"
+        for name in sorted({*sealed, *found})
+        if sealed.get(name) != found.get(name)
+    ]
 
 
 def _log_problems(sealed: Any, found: Mapping[str, list[str]]) -> list[str]:
