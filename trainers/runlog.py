@@ -10,8 +10,8 @@
         seal.json                 written when the run ends: its digest is the head of the chain
 
 A receipt holds the digests of its round's trajectory files, of the manifest and of the receipt before it; the seal
-holds those of the last receipt and of all logged lines, and how many bytes these files have. Whoever keeps the head can tell any later edit. Without it, an
-edit is told as long as its author does not compute every digest after it anew.
+holds those of the last receipt and of all logged lines, and how many bytes these files have. Whoever keeps the head can
+tell any later edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
 """
 
 from __future__ import annotations
