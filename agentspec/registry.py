@@ -3,7 +3,7 @@
 A name is one of:
 
 - a method of this package: `agentspec/<kind>/<name>.py` holds its class, and the class its declaration (see
-  :mod:`agentspec.declaration`); nothing else is imported to find it;
+  `agentspec.declaration`); nothing else is imported to find it;
 - `package.module:Class`, anybody's;
 - a name of a module that was brought in: by `import_modules` (`--import` on the command line, `imports` in a spec or
   configuration) or by an installed distribution with an entry point in the group `agentspec.modules` (`name =
@@ -79,9 +79,9 @@ class Entry:
         return self.declaration.waived
 
     @property
-    def envs(self) -> tuple[str, ...]:
-        """Environments it is written for; empty: any."""
-        return self.declaration.envs
+    def scripted(self) -> bool:
+        """Whether it plays what an environment's author scripted."""
+        return self.declaration.scripted
 
     @property
     def presets(self) -> dict[str, CallProfile]:

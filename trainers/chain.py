@@ -15,7 +15,7 @@ from typing import Any
 from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers.contents import contents, differing, field_digests
+from trainers.digests import differing, field_digests
 from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES, checkpoints
 from trainers.runlog import FORMAT, round_files, seal_of
 
@@ -147,7 +147,7 @@ def _read_file(path: Path, name: str, stated: Mapping[str, Any], problems: list[
         count += 1
         data = parse_line(path, number, line)
         expected = known[count - 1] if count <= len(known) else {}
-        edited = differing(expected, contents(data))
+        edited = differing(expected, field_digests(data))
         try:
             episodes.append(Trajectory.from_data(data))
             which = f"record {number} ({episodes[-1].episode})"

@@ -31,8 +31,8 @@ ENDS = ("context", "budget", "max_steps", "truncated")
 TOKEN_MODES = ("token_truncate", "token_mask")
 REFLECTION, REWARD = "retroformer", "reflection_gain"
 LORA_FIELDS = ("lora_r", "lora_alpha", "lora_targets", "lora_layers")
-REPORTERS = {"tensorboard": "tensorboard", "wandb": "wandb"}
-"""Where logs may go, by the extra that installs it."""
+REPORTERS = ("tensorboard", "wandb")
+"""Where logs may go, each the name of the extra that installs it."""
 
 
 def check(config: ScaffoldConfig) -> None:
@@ -94,10 +94,9 @@ def _refuse_field(name: str, value: Any) -> None:
 def check_reporters(config: Any) -> None:
     """What logs are sent through is installed."""
     for name in [config.report_to] if isinstance(config.report_to, str) else config.report_to or []:
-        extra = REPORTERS.get(name)
-        if extra and importlib.util.find_spec(name) is None:
+        if name in REPORTERS and importlib.util.find_spec(name) is None:
             raise SpecError(
-                f"report_to names {name}, which is not installed; pip install 'agentspec-rl[{extra}]', or set "
+                f"report_to names {name}, which is not installed; pip install 'agentspec-rl[{name}]', or set "
                 "`report_to: none`"
             )
 
@@ -325,11 +324,7 @@ def _check_batch_invariant(config: ScaffoldConfig) -> None:
 
 
 def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, and what to set.
-    """
+    """Refuse what does not train a reflector beside a frozen actor."""
     spec = config.spec
     if spec.reflection.name != REFLECTION:
         raise SpecError(

@@ -1,12 +1,12 @@
 """Credit: from the scored episodes of an update to rows with advantages.
 
-A :class:`CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
+A `CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
 gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
 scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
 became changes nobody's baseline, and all of them share its advantage.
 
 A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
-made after the last step earns nothing in its episode and has no row (:mod:`trainers.sequences`).
+made after the last step earns nothing in its episode and has no row (`trainers.sequences`).
 """
 
 from __future__ import annotations
@@ -63,17 +63,10 @@ class Credited:
 
 @dataclass(frozen=True)
 class CreditRule:
-    """How episodes are credited.
+    """How episodes are credited; what is not told here is told of the same field of `trainers.config.ScaffoldConfig`.
 
     Args:
         group: rollouts per task; episodes come in whole groups.
-        estimator: a name in `trainers.estimators.ESTIMATORS`.
-        gamma: discount per step, for estimators that need it.
-        gigpo_weight: weight of GiGPO's step advantage.
-        normalize: `token` or `rollout`: whether every trained token weighs alike, or every rollout.
-        overlong: `mask` (no loss, in the baseline), `keep` or `drop` (neither loss nor baseline).
-        overlong_ends: ends that make an episode overlong.
-        skip_zero_variance: leave groups that the estimator gives no signal out of the loss denominator too.
         train: which completions are trained.
         rewards: reward name -> weight.
     """
@@ -90,13 +83,8 @@ class CreditRule:
     rewards: Mapping[str, float] = field(default_factory=lambda: {"earning_delta": 1.0})
 
     @classmethod
-    def from_config(cls, config: Any) -> CreditRule:
-        """The rule of a :class:`~trainers.config.ScaffoldConfig`."""
-        return cls.from_manifest({name: getattr(config, name) for name in FIELDS})
-
-    @classmethod
     def from_manifest(cls, config: Mapping[str, Any]) -> CreditRule:
-        """The rule of a run, from the configuration that its manifest records.
+        """The rule of a run, from the fields of its configuration (in its manifest, say).
 
         Raises:
             ValueError: the record lacks a field that credit depends on.
@@ -214,7 +202,7 @@ def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
 
 
 def per_rollout(rows: Sequence[Row], gather: Gather = list) -> list[Row]:
-    """Scale advantages so that every rollout weighs the same, however many tokens its scaffold trained.
+    """Scale advantages so that every rollout has the same weight, however many tokens its scaffold trained.
 
     The loss divides by all N trained tokens; a rollout with n of them counts n / N. With the factor N / (R n), R
     rollouts with something to train, it counts 1 / R: the mean over rollouts of their mean over tokens.

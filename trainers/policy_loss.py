@@ -1,7 +1,7 @@
 """The loss of one micro-batch: log-probabilities of its rows, and the objective that the configuration names.
 
 Mixed into the trainer. TRL computes TRL's losses, from log-probabilities that are given to it here; an objective of
-:mod:`trainers.losses` is computed beside it, with TRL's divergence, importance ratio and figures.
+`trainers.losses` is computed beside it, with TRL's divergence, importance ratio and figures.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ else:
 
 
 class PolicyLoss(Base):
-    """Computes the loss of a micro-batch as of :func:`~trainers.micro_batches.collate`; see the module's docstring."""
+    """Computes the loss of a micro-batch as of `trainers.micro_batches.collate`; see the module's docstring."""
 
     _current: dict[str, Any] | None = None
 
@@ -74,7 +74,7 @@ class PolicyLoss(Base):
         return value
 
     def _own_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
-        """As TRL computes its losses, with an objective of :mod:`trainers.losses`."""
+        """As TRL computes its losses, with an objective of `trainers.losses`."""
         logps, entropies, _ = self._get_per_token_logps_and_entropies(model)
         mask, old = inputs["tool_mask"], inputs.get("old_per_token_logps", logps.detach())
         per_token = self.loss_spec.objective(logps, old, per_token_advantages(inputs), **self._limits)

@@ -42,7 +42,7 @@ def test_one_rule_from_a_configuration_and_from_its_record(tmp_path: Path) -> No
         mask_truncated=["memory.summary"],
         rewards={"env": 2.0},
     )
-    rule = CreditRule.from_config(given)
+    rule = given.credit_rule
     assert rule == CreditRule.from_manifest(given.to_dict())
     assert rule == CreditRule(
         2,
@@ -57,7 +57,7 @@ def test_one_rule_from_a_configuration_and_from_its_record(tmp_path: Path) -> No
         {"env": 2.0},
     )
     # Every value above differs from the default, so no field can be forgotten on the way.
-    plain = CreditRule.from_config(config(tmp_path))
+    plain = config(tmp_path).credit_rule
     assert all(getattr(plain, f.name) != getattr(rule, f.name) for f in fields(CreditRule) if f.name != "group")
     with pytest.raises(ValueError, match="lacks normalize"):
         CreditRule.from_manifest({n: v for n, v in given.to_dict().items() if n in FIELDS and n != "normalize"})
