@@ -1,7 +1,8 @@
 """What a write to memory earns: three estimators, chosen by name (`write_credit`), and the episodes they need.
 
-A *write* is what the policy asks for after a step, so that memory holds something else from then on (`write_calls`, by
-default every call of memory). It belongs to the step after. What it earns is one of:
+A *write* is what memory has the policy say, so that it holds (or shows) something else from then on: `write_calls`, by
+default every call of memory. What is asked after a step belongs to the step that follows; the calls of one step are one
+write. What it earns is one of:
 
 - `episode`: what the episode earns, as every other token does. Nothing more is played.
 - `local`: for some writes of an episode, drawn by its seed, the rest of the episode is played again from the state in
@@ -123,10 +124,10 @@ class WriteRule:
     def steps(self, trajectory: Trajectory, train: TrainFilter) -> list[int]:
         """The steps with a write that is trained and can earn something, in order.
 
-        What memory asks before the first action is no write: there is nothing yet that could be written.
+        At step 0 memory may write what an earlier episode of the run left to it.
         """
         calls = (call for call, _ in trained_completions(trajectory, train))
-        return sorted({c.tag.step for c in calls if self.is_write(c.tag.path) and c.tag.step > 0})
+        return sorted({c.tag.step for c in calls if self.is_write(c.tag.path)})
 
     def is_write(self, path: str) -> bool:
         """Whether calls of `path` write."""
