@@ -67,11 +67,6 @@ def newest_that_fit(texts: Sequence[str], tokens: int, count_tokens: CountTokens
     return kept[::-1]
 
 
-def rendered(recall: Recall) -> str:
-    """A recall as one text, unclipped: what the tools that print a memory show."""
-    return "\n".join(item.text for item in recall.items)
-
-
 def within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) -> list[str]:
     """As many of `texts`, from the first on, as fit into `tokens` together; none is clipped."""
     kept: list[str] = []
