@@ -49,7 +49,7 @@ class Bullet:
 
 @dataclass(frozen=True)
 class Operation:
-    """One delta. `ADD` needs a section and a text, `UPDATE` an id and a text, `MERGE` ids and a text, `REMOVE` an id."""
+    """One delta: `ADD` with section and text, `UPDATE` with id and text, `MERGE` with ids and text, `REMOVE` an id."""
 
     type: Literal["ADD", "UPDATE", "MERGE", "REMOVE"]
     section: str = ""
@@ -180,10 +180,9 @@ def operations_of(raw: Sequence[Any], most: int) -> tuple[list[Operation], int]:
     found: list[Operation] = []
     unread = 0
     for item in raw:
+        named = isinstance(item, dict) and isinstance(item.get("type"), str)
         try:
-            if isinstance(item, dict) and isinstance(item.get("type"), str):
-                item = {**item, "type": item["type"].strip().upper()}
-            found.append(check(item, Operation))
+            found.append(check({**item, "type": item["type"].strip().upper()} if named else item, Operation))
         except ParseError:
             unread += 1
     return found[:most], unread
