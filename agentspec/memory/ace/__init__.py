@@ -13,8 +13,8 @@ AgentSpec's form: the paper's unit is a task with an answer that can be tried ag
 cannot, so there is one reflection and no regeneration. What is left at an episode's end is reflected on with its
 outcome when the next episode of the run begins: paid for by the episode that can use it. `every: 0` is the paper's
 offline adaptation, one reflection per episode, and needs `scope: run`. Deltas are ADD (all that the authors' code has),
-UPDATE, MERGE and REMOVE. Presets: `paper` (two calls a step, and merges) and `rl` (two every 8 steps, none to repair or merge).
-An answer that cannot be read changes nothing; a reflection whose curation failed waits for the next one.
+UPDATE, MERGE and REMOVE. Presets: `paper` (two calls a step, and merges) and `rl` (two every 8 steps, none to repair or
+merge). An answer that cannot be read changes nothing; a reflection whose curation failed waits for the next one.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class ACE:
         waiting.cited = list(dict.fromkeys([*waiting.cited, *cited]))
         waiting.since += 1
         if self.every and waiting.since >= self.every and not (transition.terminated or transition.truncated):
-            await self._adapt(transition.input.instruction)
+            await self._adapt(transition.input.instruction, transition.next_text)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is reflected on with the outcome when the next episode of the run begins."""
@@ -193,11 +193,11 @@ class ACE:
 
     # -- reflector and curator -------------------------------------------------------------------------------------
 
-    async def _adapt(self, instruction: str) -> None:
+    async def _adapt(self, instruction: str, next_text: str = "") -> None:
         """Reflect on the steps that wait, then curate if it is time to."""
         self._waiting.since = 0
         task = clip_text(instruction.strip(), self.task_tokens, self._count) or "(not told)"
-        review = await self._reflect(task)
+        review = await self._reflect(task, next_text)
         if review is None:
             return
         self._counts.reviews += 1
@@ -210,12 +210,14 @@ class ACE:
         if len(waiting.reviews) >= self.curate_every:
             await self._curate(task)
 
-    async def _reflect(self, task: str) -> Review | None:
+    async def _reflect(self, task: str, next_text: str) -> Review | None:
         cited = [self.playbook[id] for id in self._waiting.cited if id in self.playbook]
         shown = cited or self.playbook.ordered()
         head = (prompts.CITED if cited else prompts.SHOWN).format(bullets=_lines(shown))
         steps = f"{telling.STEPS}\n{telling.numbered(self._waiting.steps)}"
-        parts = [*([head] if shown else []), steps, prompts.REVIEW]
+        state = clip_text(" ".join(next_text.split()), self.step_tokens, self._count)
+        now = [prompts.NOW.format(state=state)] if state else []
+        parts = [*([head] if shown else []), steps, *now, prompts.REVIEW]
         prompt = _prompt(prompts.REFLECTOR.format(task=task), parts)
         answer = await self.services.ask("reflect", prompt, self.answer_tokens, json_of(Review, repairs=self.repairs))
         review: Review | None = answer.value

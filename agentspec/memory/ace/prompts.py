@@ -13,6 +13,7 @@ The agent's task:
 {task}"""
 CITED = "Bullets that the agent named:\n{bullets}"
 SHOWN = "Bullets that were shown to the agent (it named none):\n{bullets}"
+NOW = "The state now:\n{state}"
 REVIEW = "Your review as JSON:"
 
 CURATOR = """\
