@@ -65,10 +65,13 @@ DECIDED = "Your decision as JSON:"
 
 @dataclass
 class Note:
-    """One note; `written` and `used` (when it was written or recalled last) are in steps of the run."""
+    """One note: steps as pairs of state and line (see `telling.course`), and what the model says of them.
+
+    `written` and `used` (when it was written or recalled last) are in steps of the run.
+    """
 
     id: int
-    content: str
+    steps: list[list[str]]
     written: int
     keywords: list[str] = field(default_factory=list)
     context: str = ""
@@ -85,10 +88,11 @@ class Note:
 
     def text(self) -> str:
         """What is embedded: content, context, keywords and tags."""
-        return " ".join([self.content, self.context, *self.keywords, *self.tags])
+        content = [part for pair in self.steps for part in pair if part]
+        return " ".join([*content, self.context, *self.keywords, *self.tags])
 
     def described(self, content: str) -> str:
-        """As the model reads it, with `content` in place of the whole."""
+        """As the model reads it, with `content` for its steps."""
         about = [f"({', '.join(self.tags)})"] if self.tags else []
         parts = [f"[{self.name}]", *([self.context] if self.context else []), *about]
         return f"{' '.join(parts)}\n{content}"
@@ -130,7 +134,7 @@ class AMem:
         every: steps in a note.
         top: notes recalled by similarity; linked notes come on top of these, at most as many again.
         neighbours: nearest notes that a new one is held against.
-        step_tokens: most tokens of a step in a note.
+        step_tokens: most tokens of a step's state in a note.
         note_tokens: most tokens of a note's content where it is recalled or shown as a neighbour.
         answer_tokens: room for an answer.
         repairs: further calls for an answer that cannot be read (0 or 1).
@@ -183,7 +187,7 @@ class AMem:
         self.capacity = capacity
         self._index = VectorIndex(services.embedder) if services.embedder else None
         self._notes: dict[int, Note] = {}
-        self._open: list[list[str]] = []  # steps of the note to come, as it holds them and as a line
+        self._open: list[list[str]] = []  # steps of the note to come
         self._plain: list[int] = []  # notes of an episode's end that wait to be described
         self._due = False
         self._evolved = 0
@@ -204,7 +208,7 @@ class AMem:
             for note in [self._notes[id] for id in waiting if id in self._notes]:
                 await self._write(note)
         source = self.services.llm.module
-        texts = [note.described(self._clip(note.content)) for note in self._found(input.text, k or self.top)]
+        texts = [self._shown(note) for note in self._found(input.text, k or self.top)]
         recall = telling.listed([*([telling.NOTES] if texts else []), *texts], source)
         if self.services.context.layout == "conversation":
             return recall
@@ -213,7 +217,7 @@ class AMem:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
-        self._open.append([seen.block(self.step_tokens, self._count), seen.line()])
+        self._open.append([clip_text(" ".join(seen.state.split()), self.step_tokens, self._count), seen.line()])
         if len(self._open) < self.every:
             return
         note = self._keep()
@@ -228,20 +232,19 @@ class AMem:
             return
         ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
         if self._open:
-            self._plain = [self._keep(ended).id]
+            self._open.append(["", ended])
+            self._plain = [self._keep().id]
         elif self._notes:
             note = self.notes[-1]
-            note.content += f"\n{ended}"
+            note.steps = [*note.steps, ["", ended]]
             self._embed(note)
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
-    def _keep(self, *more: str) -> Note:
-        """A plain note of the open steps and of what is to be said of them; over capacity the one used longest ago
-        goes."""
+    def _keep(self) -> Note:
+        """A plain note of the open steps; over capacity the one used longest ago goes."""
         now = self.services.time().total
-        content = "\n".join([*(block for block, _ in self._open), *more])
-        note = Note(self.services.new_id(), content, now, used=now)
+        note = Note(self.services.new_id(), self._open, now, used=now)
         self._open = []
         while len(self._notes) >= self.capacity:
             oldest = min(self._notes.values(), key=lambda n: (n.used, n.id))
@@ -254,7 +257,8 @@ class AMem:
 
     async def _write(self, note: Note) -> None:
         """Describe a note, then let it and its neighbours evolve."""
-        shown = prompt(ANALYSE, NOTE.format(note=note.content), FILED)
+        content = telling.course(note.steps, len(note.steps) * (self.step_tokens + 64), self._count)
+        shown = prompt(ANALYSE, NOTE.format(note=content), FILED)
         analysed = await self.services.ask(
             "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs)
         )
@@ -265,8 +269,8 @@ class AMem:
         near = self._near(note)
         if not near:
             return
-        listed = "\n\n".join(other.described(self._clip(other.content)) for other in near)
-        shown = prompt(EVOLVE, NEAREST.format(notes=listed), NEW.format(note=note.described(note.content)), DECIDED)
+        listed = "\n\n".join(map(self._shown, near))
+        shown = prompt(EVOLVE, NEAREST.format(notes=listed), NEW.format(note=note.described(content)), DECIDED)
         answer = await self.services.ask("evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs))
         if answer.value is not None and answer.value.evolve:
             self._evolve(note, near, answer.value)
@@ -309,11 +313,11 @@ class AMem:
             note.used = self.services.time().total
         return found
 
-    def _clip(self, text: str) -> str:
-        return clip_text(text, self.note_tokens, self._count)
+    def _shown(self, note: Note) -> str:
+        return note.described(telling.course(note.steps, self.note_tokens, self._count))
 
     def _line(self, text: str) -> str:
-        return self._clip(" ".join(text.split()))
+        return clip_text(" ".join(text.split()), self.note_tokens, self._count)
 
     def _count(self, text: str) -> int:
         return self.services.llm.count_tokens(text)

@@ -40,11 +40,9 @@ def test_a_note_describes_itself_and_the_first_one_has_nothing_to_evolve() -> No
     (note,) = memory.notes
     assert script.purposes == ["analyse"]
     assert (note.keywords, note.context, note.tags) == (["mill", "order 3"], "Order 3 waits at the mill.", ["order"])
-    assert (
-        note.text() == "State: At the mill.\nAction: WAIT()\nResult: done Order 3 waits at the mill. mill order 3 order"
-    )
+    assert note.text() == "At the mill. 1. WAIT() -> done Order 3 waits at the mill. mill order 3 order"
     items = asyncio.run(memory.retrieve(seen("mill"))).items
-    assert items[1].text == "[n0] Order 3 waits at the mill. (order)\nState: At the mill.\nAction: WAIT()\nResult: done"
+    assert items[1].text == "[n0] Order 3 waits at the mill. (order)\nState: At the mill.\n1. WAIT() -> done"
 
 
 def test_exactly_the_addressed_neighbours_change() -> None:
@@ -154,11 +152,11 @@ def test_steps_come_together_in_a_note_and_the_last_is_described_in_the_next_epi
     recalled(other, "s2")
     assert script.purposes == ["analyse", "analyse", "evolve"]
     assert other.notes[1].context == "c" and memory.notes[1].context == ""  # a copy shares nothing
-    assert other.notes[1].content.endswith("The episode ended after 3 steps. Return: +1.50.")
+    assert other.notes[1].steps[-1] == ["", "The episode ended after 3 steps. Return: +1.50."]
 
 
 def test_notes_are_named_by_ids_that_go_on() -> None:
-    assert Note(7, "x", 0).described("x") == "[n7]\nx"
+    assert Note(7, [], 0).described("x") == "[n7]\nx"
     memory = AMem(services(Asked(analyse=PLAIN, evolve=STAY)), capacity=1)
     learn(memory, "a", "b")
     assert [n.name for n in memory.notes] == ["n1"]
