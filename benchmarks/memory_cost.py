@@ -9,8 +9,8 @@ model calls; the state at the end; the share of memory's answers that could not 
 `--to DIR` writes `memory.md` and `memory.json` there.
 
 The paper's ratios are its tokens per step relative to ReAct + Base of the same table (`../shared/paper/results.csv`,
-the median over its backbones, with the range): large models, the method's own cadence, long outputs. Ours are of a small
-model with the cheap preset, so the ratios are set side by side, not tested against each other.
+the median over its backbones, with the range): large models, the method's own cadence, long outputs. Ours are of a
+small model with the cheap preset, so the ratios are set side by side, not tested against each other.
 """
 
 from __future__ import annotations
@@ -167,8 +167,8 @@ def markdown(rows: Mapping[str, Mapping[str, Any]], paper: Mapping[str, Any], ab
     lines = [
         "# What memories cost",
         "",
-        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset `{about['preset']}`; "
-        "per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base, median over its backbones "
+        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset `{about['preset']}`;",
+        "per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base, median over its backbones",
         "(least to most).",
         "",
         f"    {about['command']}",
@@ -219,9 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         allow_abbrev=False, description=description, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--methods", nargs="*", default=[], metavar="NAME", help="these and base (default: all)"
-    )
+    parser.add_argument("--methods", nargs="*", default=[], metavar="NAME", help="these and base (default: all)")
     parser.add_argument("--steps", type=int, default=20, help="of the episode (default: %(default)s)")
     parser.add_argument("--preset", default="rl", help="of methods that have presets (default: %(default)s)")
     parser.add_argument("--model", default="smollm2-135m", help="as `agentspec run --policy` (default: %(default)s)")
