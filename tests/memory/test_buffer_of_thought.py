@@ -80,7 +80,7 @@ def test_the_threshold_of_looking_up(threshold: float, found: bool) -> None:
 @pytest.mark.parametrize(("threshold", "kept"), [(0.71, 1), (0.72, 2)])
 def test_the_threshold_of_keeping(threshold: float, kept: int) -> None:
     script = Asked(distil="x", template=[template(FIRST), template(NEAR)])
-    memory = BufferOfThought(services(script), threshold=threshold)
+    memory = BufferOfThought(services(script), keep_threshold=threshold)
     for _ in range(3):
         play(memory, "s")
     assert [t.description for t in memory.templates] == [FIRST, NEAR][:kept]
