@@ -73,6 +73,7 @@ class Note:
     id: int
     steps: list[list[str]]
     written: int
+    episode: int = 0
     keywords: list[str] = field(default_factory=list)
     context: str = ""
     tags: list[str] = field(default_factory=list)
@@ -212,7 +213,7 @@ class AMem:
         recall = telling.listed([*([telling.NOTES] if texts else []), *texts], source)
         if self.services.context.layout == "conversation":
             return recall
-        lines = [RecallItem(line, source=source, priority=i) for i, (_, line) in enumerate(self._open)]
+        lines = [RecallItem(line, kind="step", source=source, priority=i) for i, (_, line) in enumerate(self._open)]
         return Recall((*recall.items, *lines))
 
     async def store(self, transition: Transition) -> None:
@@ -244,7 +245,7 @@ class AMem:
     def _keep(self) -> Note:
         """A plain note of the open steps; over capacity the one used longest ago goes."""
         now = self.services.time().total
-        note = Note(self.services.new_id(), self._open, now, used=now)
+        note = Note(self.services.new_id(), self._open, now, self.services.time().episode, used=now)
         self._open = []
         while len(self._notes) >= self.capacity:
             oldest = min(self._notes.values(), key=lambda n: (n.used, n.id))
@@ -314,7 +315,8 @@ class AMem:
         return found
 
     def _shown(self, note: Note) -> str:
-        return note.described(telling.course(note.steps, self.note_tokens, self._count))
+        when = telling.when(note.episode, self.services.time().episode)
+        return note.described(when + telling.course(note.steps, self.note_tokens, self._count))
 
     def _line(self, text: str) -> str:
         return clip_text(" ".join(text.split()), self.note_tokens, self._count)

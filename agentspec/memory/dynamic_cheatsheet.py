@@ -178,7 +178,8 @@ class DynamicCheatsheet:
         text = f"{HEADER}\n{self._sheet}"
         items = [RecallItem(text, kind="summary", source=self._name, priority=math.inf)] if self._sheet else []
         if self.services.context.layout == "snapshot":
-            items += [RecallItem(line, source=self._name, priority=i) for i, line in enumerate(self._lines)]
+            since = enumerate(self._lines)
+            items += [RecallItem(line, kind="step", source=self._name, priority=i) for i, line in since]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -228,7 +229,11 @@ class DynamicCheatsheet:
         if self._index is None or not self._pairs or not (self._due or self._waited >= self.every):
             return
         found = self._similar(input.text, top)
-        pairs = [f"Similarity {score:.2f}:\n{self._pairs[key][1]}" for key, score in found]
+        now = self.services.time().episode
+        pairs = [
+            f"{telling.when(self._pairs[key][0], now)}Similarity {score:.2f}:\n{self._pairs[key][1]}"
+            for key, score in found
+        ]
         shown = [f"{SIMILAR}\n{telling.numbered(pairs)}"] if pairs else []
         since = [f"{telling.STEPS}\n{telling.numbered(self._since)}"] if self._since else []
         state = NOW.format(state=self._state(input.text))

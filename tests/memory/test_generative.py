@@ -105,6 +105,8 @@ def test_reward_is_the_importance_and_no_model_is_asked() -> None:
     assert [memory.stream.importance(m.id) for m in memory.stream] == [0.0, 2.5, -1.0]
     assert shown(memory, "state 1", 1)[1] == "State: state 1\n2. WAIT() -> done (+2.50)"
     assert not memory.services.llm.recorder.calls
+    memory.services.clock.episode = 1  # step numbers of another episode are marked as such
+    assert shown(memory, "state 1", 1)[1] == "(Episode 1, over) State: state 1\n2. WAIT() -> done (+2.50)"
 
 
 def test_the_model_rates_every_event() -> None:
@@ -171,7 +173,7 @@ def test_thoughts_rest_on_what_was_shown() -> None:
     assert thoughts[0].evidence == [1 - first, first] and thoughts[1].evidence == [first]
     assert [memory.stream.importance(m.id) for m in thoughts] == [8, 10]
     assert "The question: Is it hot?" in asked and "[1]\nState: state" in asked
-    assert "The oven is hot." in shown(memory, "oven hot", 1)
+    assert "Conclusion: The oven is hot." in shown(memory, "oven hot", 1)
     learn(memory, 0, 0)
     assert sum(m.thought for m in memory.stream) == 2  # word for word the same: once
 

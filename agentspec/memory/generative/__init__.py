@@ -45,6 +45,7 @@ WEIGHTS = {"reward": (0.4, 0.2, 0.4), "llm": (1.0, 1.0, 1.0)}
 """Weights of recency, importance and relevance, by kind of importance."""
 
 LOWEST, MIDDLE, HIGHEST = 1, 5, 10
+THOUGHT = "Conclusion: {text}"
 RECENT = 100
 """Newest memories that questions are asked of."""
 
@@ -164,7 +165,7 @@ class GenerativeMemory:
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
         state = clip_text(" ".join(seen.state.split()), 4 * self.entry_tokens, self._count)
-        event = Memory(self.services.new_id(), seen.line(), state)
+        event = Memory(self.services.new_id(), seen.line(), state, self.services.time().episode)
         self.stream.add(event, MIDDLE if self.rated else seen.reward, self.services.time().total)
         if self.rated:
             self._unrated = [*self._unrated, event.id][-2 * self.every :]
@@ -242,7 +243,10 @@ class GenerativeMemory:
         self.stream.add(thought, worth, self.services.time().total)
 
     def _shown(self, memory: Memory) -> str:
-        return telling.course([[memory.state, memory.line]], self.entry_tokens, self._count)
+        if memory.thought:
+            return THOUGHT.format(text=memory.line)
+        when = telling.when(memory.episode, self.services.time().episode)
+        return when + telling.course([[memory.state, memory.line]], self.entry_tokens, self._count)
 
     def _task(self, instruction: str) -> str:
         return clip_text(instruction.strip(), self.task_tokens, self._count) or "(not told)"

@@ -31,6 +31,7 @@ class Memory:
     id: int
     line: str
     state: str = ""
+    episode: int = 0
     thought: bool = False
     evidence: list[int] = field(default_factory=list)
 
