@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from agentspec.memory.amem import AMem, Note
+from agentspec.memory.amem import AMem
+from agentspec.memory.amem.notes import Note
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
 from tests.memory.recall_world import succeeds
 

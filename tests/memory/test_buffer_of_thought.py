@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from agentspec.memory.buffer_of_thought import COARSE, BufferOfThought, Template
+from agentspec.memory.buffer_of_thought import BufferOfThought
+from agentspec.memory.buffer_of_thought.templates import COARSE, Template
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import AgentSpec
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step

@@ -143,7 +143,8 @@ class GenerativeMemory:
         self.entry_tokens, self.stream_tokens = entry_tokens, stream_tokens
         self.task_tokens, self.answer_tokens, self.repairs = chosen["task_tokens"], answer_tokens, chosen["repairs"]
         defaults = zip((weight_recency, weight_importance, weight_relevance), WEIGHTS[importance], strict=True)
-        weights = Weights(*(default if value is None else value for value, default in defaults), decay=decay)
+        recency, share, relevance = (default if value is None else value for value, default in defaults)
+        weights = Weights(recency, share, relevance, decay)
         self.stream = Stream(services.embedder, weights, max_memories)
         self._unrated: list[int] = []
         self._sum = 0.0  # importance of events since the last reflection
