@@ -18,8 +18,6 @@ recalled longest ago goes first.
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory import telling
@@ -252,12 +250,12 @@ class AMem:
 
     def snapshot(self) -> bytes:
         order = list(self._index) if self._index is not None else []
-        notes = [asdict(note) for note in self._notes.values()]
+        notes = [note.row() for note in self._notes.values()]
         return dump_state([notes, order, self._open, self._plain, self._due, self._evolved])
 
     def restore(self, blob: bytes) -> None:
         notes, order, self._open, self._plain, self._due, self._evolved = load_state(blob)
-        self._notes = {data["id"]: Note(**data) for data in notes}
+        self._notes = {row[0]: Note(*row) for row in notes}
         if self._index is not None:
             self._index.load([(id, self._notes[id].text()) for id in order])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 MOST_WORDS = 8
 """Keywords, and tags, of a note."""
@@ -31,6 +32,11 @@ class Note:
     def name(self) -> str:
         """The id that the model sees."""
         return f"n{self.id}"
+
+    def row(self) -> list[Any]:
+        """JSON-like fields in the order of the constructor's arguments."""
+        about = [self.keywords, self.context, self.tags, self.links]
+        return [self.id, self.steps, self.written, self.episode, *about, self.used, self.recalled, self.history]
 
     def text(self) -> str:
         """What is embedded: content, context, keywords and tags."""

@@ -27,13 +27,15 @@ from __future__ import annotations
 import math
 import re
 
+import numpy as np
+
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory import telling
 from agentspec.memory.dynamic_cheatsheet import prompts
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
-from agentspec.retrieval import VectorIndex
+from agentspec.retrieval import VectorIndex, top_rows
 from agentspec.state import dump_state, load_state
 from agentspec.structured import ParseError, Parser, without_thinking
 from agentspec.tokens import clip_text
@@ -223,12 +225,15 @@ class DynamicCheatsheet:
         """Keys of the steps to be shown with their similarity, least similar first; of earlier episodes if there are
         enough."""
         assert self._index is not None
-        episode, shown = self.services.time().episode, set(self._unseen)
-        of = {key: number for key, (number, _) in self._pairs.items()}
-        found = self._index.search(text, top, where=lambda key: key not in shown and of[key] != episode)
-        if len(found) < top:
-            more = self._index.search(text, top, where=lambda key: key not in shown and of[key] == episode)
-            found += more[: top - len(found)]
+        scores, keys = self._index.scores(text), list(self._pairs)  # in the same order
+        of = np.fromiter((episode for episode, _ in self._pairs.values()), dtype=np.int64, count=len(keys))
+        known = np.arange(len(keys)) >= len(keys) - len(self._unseen)  # they are the newest
+        earlier = (of != self.services.time().episode) & ~known
+        found: list[tuple[int, float]] = []
+        for among in (earlier, ~earlier & ~known):
+            rows = np.flatnonzero(among)
+            best = rows[top_rows(scores[rows], top - len(found))]
+            found += [(keys[row], float(scores[row])) for row in best]
         return sorted(found, key=lambda pair: pair[1])
 
     async def _rewrite(self, purpose: str, instruction: str, parts: list[str], where: str) -> None:

@@ -12,14 +12,14 @@ summed (Park et al., 2023, section 4.1):
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agentspec.protocols import Embedder
-from agentspec.retrieval import VectorIndex
+from agentspec.retrieval import VectorIndex, top_rows
 
 Floats = NDArray[np.float64]
 
@@ -115,27 +115,24 @@ class Stream:
     def recall(self, query: str, k: int, now: int) -> list[tuple[Memory, float]]:
         """The `k` best memories with their scores, best first; of equals the one written first. They count as used."""
         scores = self.scores(query, now)
-        n = len(scores)
-        candidates = np.arange(n)
-        if 0 < k < n:  # only what may be among the first k is sorted
-            candidates = np.flatnonzero(scores >= np.partition(scores, n - k)[n - k])
-        best = candidates[np.argsort(-scores[candidates], kind="stable")][:k]
+        best = top_rows(scores, k)
         self._used[best] = now
         ids = list(self._memories) if len(best) else []
         return [(self._memories[ids[row]], float(scores[row])) for row in best]
 
     def state(self) -> list[Any]:
         """JSON-like state."""
-        rows = [[asdict(m), self._used[i], self._importance[i]] for i, m in enumerate(self)]
-        return [rows, self.evicted]
+        n = len(self._memories)
+        rows = [[m.id, m.line, m.state, m.episode, m.thought, m.evidence] for m in self]
+        return [rows, self._used[:n].tolist(), self._importance[:n].tolist(), self.evicted]
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""
-        rows, self.evicted = state
-        self._memories = {data["id"]: Memory(**data) for data, _, _ in rows}
+        rows, used, importance, self.evicted = state
+        self._memories = {row[0]: Memory(*row) for row in rows}
         self._row = {id: row for row, id in enumerate(self._memories)}
-        self._used = np.array([used for _, used, _ in rows], dtype=np.float64)
-        self._importance = np.array([importance for *_, importance in rows], dtype=np.float64)
+        self._used = np.array(used, dtype=np.float64)
+        self._importance = np.array(importance, dtype=np.float64)
         if self._index is not None:
             self._index.load([(m.id, m.text()) for m in self])
 
