@@ -191,8 +191,8 @@ class _Reader:
         found = self._line()
         if found is None:
             inline = _MID_LABEL.search(self.text)
-            named = self._value(self.text[inline.end() :]) if inline else None
-            found = (named, inline.start()) if inline and named else None
+            meant = self._value(self.text[inline.end() :]) if inline else None
+            found = (meant, inline.start()) if inline and meant else None
         action, at = found or (self._mention(), len(self.text))
         if action is None:
             return Reading(self._nothing(self.text), _thought(self.text))

@@ -26,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.city.generate import city_of
 from agentspec.envs.deliverybench.outcome import MAX_ACTION, Last, plan_of
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe, state_hash
@@ -36,7 +35,7 @@ from agentspec.envs.deliverybench.view.instruction import instruction
 from agentspec.envs.deliverybench.view.menu import MORE, Option, pages
 from agentspec.envs.deliverybench.world.engine import World
 from agentspec.envs.deliverybench.world.events import Progress, events_since
-from agentspec.envs.deliverybench.world.grammar import advertised
+from agentspec.envs.deliverybench.world.grammar import advertised, understood
 from agentspec.envs.deliverybench.world.rules import Rules, rules_named
 from agentspec.envs.deliverybench.world.thinking import ThinkTime
 from agentspec.metrics import Metric
@@ -342,7 +341,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         schema = ActionSchema(
             self.world.schema.actions, self.world.schema.aliases, self.world.schema.units, tuple(self._menu)
         )
-        action = parse_action(text, schema)
+        action = understood(text, schema)
         if isinstance(action, ActionError):
             return text, action.message
         chosen: Option | None = self._menu.get(action.name)
