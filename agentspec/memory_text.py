@@ -39,9 +39,7 @@ def read_bank(source: str | Path) -> MemoryBank:
     path = Path(source)
     path = path / FILE if path.is_dir() else path
     if not path.is_file():
-        raise SpecError(
-            f"there is no {path}; give a memory file (`memory.json`), or the folder of a run that wrote one"
-        )
+        raise SpecError(f"there is no {path}; give a memory file, or the folder of a run that wrote one")
     try:
         return MemoryBank.load(path.read_bytes())
     except ValueError as error:
@@ -125,9 +123,8 @@ def diff(one: MemoryBank, other: MemoryBank, task: str = "") -> list[str]:
     mine, theirs = entries(one), entries(other)
     shared = [key for key in mine if key in theirs and key.startswith(task)]
     if task and not shared:
-        raise SpecError(
-            f"--task {task!r} names no task that both files hold; they share {', '.join(mine & theirs.keys())}"
-        )
+        known = ", ".join(key for key in mine if key in theirs)
+        raise SpecError(f"--task {task!r} names no task that both files hold; they share {known or 'none'}")
     for key in shared:
         pairs.append((key, mine[key], theirs[key]))
     if not shared:

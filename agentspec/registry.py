@@ -2,7 +2,7 @@
 
 A name is one of:
 
-- a method of this package: `agentspec/<kind>/<name>.py` (or the folder `<name>/` with an `__init__.py`) holds its class,
+- a method of this package: `agentspec/<kind>/<name>.py` (or a folder `<name>` with an `__init__.py`) holds its class,
   and the class its declaration (see :mod:`agentspec.declaration`); nothing else is imported to find it;
 - `package.module:Class`, anybody's;
 - a name of a module that was brought in: by `import_modules` (`--import` on the command line, `imports` in a spec or

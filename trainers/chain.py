@@ -7,6 +7,7 @@ author did not compute all later digests anew. Who did can be told by the head o
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers.contents import contents, differing, field_digests
-from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES, checkpoints
+from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, UPDATES, checkpoints
 from trainers.runlog import FORMAT, round_files, seal_of
 
 SHOWN = 20
@@ -120,16 +121,19 @@ def files_of(record: Mapping[str, Any]) -> dict[str, Any]:
     return dict(files) if isinstance(files, Mapping) else {}
 
 
-def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> list[Trajectory]:
-    """The episodes of a receipt's round in the order of the global batch; every edit of a file of the round is told."""
+def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> dict[str, list[Trajectory]]:
+    """The episodes of a receipt's round by the run's folder they lie in, each in the order of the global batch.
+
+    Every edit of a file of the round is told.
+    """
     present = {p.relative_to(folder).as_posix(): p for p in round_files(folder)}
-    episodes: list[Trajectory] = []
+    episodes: dict[str, list[Trajectory]] = defaultdict(list)
     for name, stated in sorted(files_of(record).items(), key=lambda item: (_rank(item[0]), item[0])):
         if name not in present:
             problems.append(f"{name} is missing")
             continue
         read = _read_file(present[name], name, stated if isinstance(stated, Mapping) else {}, problems)
-        episodes += read if name.startswith(f"{TRAJECTORIES}/") else []
+        episodes[name.partition("/")[0]] += read
     return episodes
 
 

@@ -21,7 +21,8 @@ from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import field_rules
 from trainers.losses import LOSSES, loss
-from trainers.sequences import unmatched_patterns
+from trainers.sequences import TrainFilter, unmatched_patterns
+from trainers.writes import write_credit
 
 if TYPE_CHECKING:
     from trainers.config import ScaffoldConfig
@@ -46,6 +47,7 @@ def check(config: ScaffoldConfig) -> None:
     check_names(config)
     check_calls(config)
     check_lora(config)
+    check_writes(config)
     check_loss(config)
     check_rounds(config)
     check_validation(config)
@@ -152,6 +154,43 @@ def check_calls(config: ScaffoldConfig) -> None:
         raise SpecError(
             "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full "
             "distribution and would not match the sampled ones; train with top_p 1 and top_k 0"
+        )
+
+
+WRITE_FIELDS = ("write_rerolls", "write_points")
+
+
+def check_writes(config: ScaffoldConfig) -> None:
+    """Estimators of a write have writes to credit, and no setting of theirs changes nothing."""
+    spec = write_credit(config.write_credit)
+    for name in WRITE_FIELDS:
+        if getattr(config, name) < 1:
+            raise SpecError(f"{name} is {getattr(config, name)}; expected at least 1")
+        if getattr(config, name) != _default(config, name) and name not in spec.reads:
+            raise SpecError(
+                f"{name} {getattr(config, name)} changes nothing with write_credit {spec.name!r}; leave it out, or set "
+                "`write_credit: local`"
+            )
+    if spec.function is None:
+        if config.write_calls != _default(config, "write_calls"):
+            raise SpecError(
+                f"write_calls {config.write_calls} changes nothing with write_credit 'episode'; leave it out"
+            )
+        return
+    agent = config.spec
+    if agent.roles and spec.reads:
+        raise SpecError(
+            f"write_credit {spec.name!r} with roles {list(agent.roles)}: an episode is played again from its recorded "
+            "answers, and those of helper models are not given back; use `write_credit: ablation`, or no helper"
+        )
+    helped = {m for pattern in agent.roles for m in agent.helped(pattern)}
+    paths = [p for p in agent.call_paths() if p.startswith("memory.") and p.partition("/")[0] not in helped]
+    trained = [p for p in paths if config.train_filter.matches(p) and TrainFilter(tuple(config.write_calls)).matches(p)]
+    if not trained:
+        raise SpecError(
+            f"write_credit {spec.name!r}, but no call of memory {agent.memory.name!r} is both trained (train_calls "
+            f"{config.train_calls}) and a write (write_calls {config.write_calls}); its calls are "
+            f"{', '.join(paths) or 'none that the policy answers'}; add 'memory.*' to train_calls"
         )
 
 
@@ -275,6 +314,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
         raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
     if REWARD not in config.reward_set.weights:
         raise SpecError(f"rewards {config.rewards}: a lesson is paid the change of return; give {REWARD!r} a weight")
+    if config.write_credit != "episode":
+        raise SpecError(f"write_credit {config.write_credit!r}: only the lesson is trained, no write of a memory")
     if config.lora_r == 0:
         raise SpecError("lora_r is 0: all weights would be trained, the actor's among them; give the reflector a rank")
     if config.use_vllm:
@@ -295,6 +336,12 @@ def notes(config: ScaffoldConfig) -> list[str]:
     spec = loss(config.loss_type)
     if spec.depends_on_rows:
         found.append(f"loss_type {spec.name}: {spec.depends_on_rows}; 'dapo' does not depend on rows")
+    memory = [p for p in config.spec.call_paths() if p.startswith("memory.") and config.train_filter.matches(p)]
+    if memory and "aux" not in config.train_credits and config.spec.memory.name != "summary":
+        found.append(
+            f"train_calls match {', '.join(memory)}, and train_credits {config.train_credits} lack 'aux': what a "
+            "memory asks is help unless it says otherwise, so nothing of it is trained"
+        )
     if config.top_entropy_quantile < 1:
         found.append("top_entropy_quantile: the quantile is of each micro-batch, so it depends on how rows are split")
     return found

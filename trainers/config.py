@@ -20,6 +20,7 @@ from rewards import RewardSet
 from trainers.checks import check
 from trainers.estimators import ESTIMATORS
 from trainers.sequences import TrainFilter
+from trainers.writes import WRITE_CREDITS
 
 CHECKPOINTING = (
     "activation_checkpointing" if hasattr(GRPOConfig, "activation_checkpointing") else "gradient_checkpointing"
@@ -59,6 +60,11 @@ class ScaffoldConfig(GRPOConfig):
             of its ``best``. All rollouts of a task start from the same memory; tasks share none.
         start_memory: with ``scope: run``, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
+        write_credit: what trained calls of memory earn, a name in :data:`~trainers.writes.WRITE_CREDITS`: what the
+            ``episode`` does, ``local`` re-rolls with and without the write, or the ``ablation`` of the whole memory.
+        write_calls: patterns of the calls that write (those of memory; narrow it to leave out what only recalls).
+        write_rerolls: with ``local``: re-rolls with, and as many without, each write that is looked at.
+        write_points: with ``local``: most writes of an episode that are looked at; the others earn 0.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
@@ -109,6 +115,10 @@ class ScaffoldConfig(GRPOConfig):
     mask_truncated: list[str] = field(default_factory=list)
     memory_carry: str = field(default="first", metadata={"help": "first or best"})
     start_memory: str = field(default="", metadata={"help": "memory file or run folder to start from"})
+    write_credit: str = field(default="episode", metadata={"help": ", ".join(WRITE_CREDITS)})
+    write_calls: list[str] = field(default_factory=lambda: ["memory.*"])
+    write_rerolls: int = field(default=2, metadata={"help": "re-rolls with and without a write"})
+    write_points: int = field(default=1, metadata={"help": "writes of an episode that are re-rolled"})
     retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
     env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
     rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})

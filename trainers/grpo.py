@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,9 @@ from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
+from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
+from trainers.counterfactuals import play_beside
+from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, CreditRule, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.finite import FiniteGuard, without_dropout
@@ -139,7 +143,11 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
             memory=self._memory,
         )
         with self._current_weights():
-            return self._play(jobs)
+            episodes = self._play(jobs)
+            if self.credit_rule.writes.spec.function is None:
+                return episodes
+            runner = replace(self._runner(self.args.spec), progress=None)
+            return play_beside(runner, jobs, episodes, self.credit_rule, retries=self.args.retries)
 
     def _runner(self, spec: AgentSpec) -> Runner:
         """Runs episodes of ``spec`` with the policy as it is."""
@@ -251,6 +259,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         for name, value in figures.items():
             self._metrics["train"][name].append(value)
         self.run_log.trajectories(self._round, self.accelerator.process_index, episodes)
+        if beside := counterfactuals(self._played):
+            self.run_log.trajectories(self._round, self.accelerator.process_index, beside, COUNTERFACTUALS)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
