@@ -72,6 +72,15 @@ def outcome(transitions: Sequence[Transition], success: object = None) -> str:
     return OUTCOME.format(steps=len(transitions), total=sum(t.reward for t in transitions), success=verdict)
 
 
+def when(episode: int, now: int) -> str:
+    """A mark in front of what an earlier episode left, whose step numbers are its own; empty for the present one.
+
+    >>> when(0, 2), when(2, 2)
+    ('(Episode 1, over) ', '')
+    """
+    return "" if episode == now else f"(Episode {episode + 1}, over) "
+
+
 def numbered(blocks: Iterable[str]) -> str:
     """Blocks one after the other, each under its number."""
     return "\n\n".join(f"[{i}]\n{block}" for i, block in enumerate(blocks, 1))

@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from agentspec.memory.amem import AMem, Note
+from agentspec.memory.amem import AMem
+from agentspec.memory.amem.notes import Note
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
 from tests.memory.recall_world import succeeds
 
@@ -104,6 +105,9 @@ def test_links_are_followed_one_way_and_at_most_as_many_as_were_asked_for() -> N
     notes[0].links = [1, 2, 9]  # 9 is gone
     assert recalled(memory, "red key", 1) == ["n0", "n1"]
     assert recalled(memory, "far hill", 1) == ["n1"]
+    assert "over" not in memory._shown(notes[0])
+    memory.services.clock.episode = 2  # step numbers of another episode are marked as such
+    assert memory._shown(notes[0]) == "[n0]\n(Episode 1, over) State: red key\n1. WAIT() -> done"
     # The two nearest are n0 and, of the notes that share no word but the labels, one more; links fill up to two others.
     nearest, linked = recalled(memory, "red key", 2)[:2], recalled(memory, "red key", 2)[2:]
     assert nearest[0] == "n0" and linked == [n for n in ("n1", "n2") if n not in nearest]

@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from agentspec.memory.buffer_of_thought import COARSE, BufferOfThought, Template
+from agentspec.memory.buffer_of_thought import BufferOfThought
+from agentspec.memory.buffer_of_thought.templates import COARSE, Template
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import AgentSpec
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
@@ -80,7 +81,7 @@ def test_the_threshold_of_looking_up(threshold: float, found: bool) -> None:
 @pytest.mark.parametrize(("threshold", "kept"), [(0.71, 1), (0.72, 2)])
 def test_the_threshold_of_keeping(threshold: float, kept: int) -> None:
     script = Asked(distil="x", template=[template(FIRST), template(NEAR)])
-    memory = BufferOfThought(services(script), threshold=threshold)
+    memory = BufferOfThought(services(script), keep_threshold=threshold)
     for _ in range(3):
         play(memory, "s")
     assert [t.description for t in memory.templates] == [FIRST, NEAR][:kept]

@@ -14,7 +14,7 @@ from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import AgentSpec
 from agentspec.structured import ParseError
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
-from tests.memory.recall_world import notes, succeeds
+from tests.memory.recall_world import notes, succeeds, walk
 
 SHEET = "<cheatsheet>\n- {}\n</cheatsheet>"
 
@@ -159,6 +159,7 @@ def test_steps_of_earlier_episodes_come_first() -> None:
     learn(memory, step(0, "a red door", "GO(8)"))
     shown(memory, "a red door")
     assert "GO(7)" in script.prompt() and "GO(8)" not in script.prompt()
+    assert "(Episode 1, over) Similarity" in script.prompt()
     assert "The episode ended after 1 steps." in script.prompt()
 
 
@@ -198,3 +199,15 @@ def test_a_fact_seen_long_ago_is_still_on_the_sheet(preset: str, variant: str, l
     curate = {"curate": tagged, "synthesise": tagged}
     assert succeeds(memory, scope=scope, layout=layout, curate=curate)
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
+
+
+def test_a_transcript_of_the_steps_is_not_told_twice() -> None:
+    # ReAct in the snapshot layout has a transcript of its own: steps that the sheet does not know yet stand in it once.
+    memory = {"name": "dc", "every": 10}
+    [trajectory], reader = walk(memory, delay=4, reasoning="react")
+    acting = [r for r in reader.asked if not r.tag.module.startswith("memory.")]
+    prompt = acting[-1].messages[-1].text
+    assert trajectory.status == "completed" and "Transcript so far" in prompt
+    assert "1. WALK() ->" not in prompt
+    [_], reader = walk(memory, delay=4)
+    assert "1. WALK() ->" in [r for r in reader.asked if not r.tag.module.startswith("memory.")][-1].messages[-1].text

@@ -8,8 +8,12 @@ instance taken out. In every episode:
    as new and the nearest of three coarse templates stands in;
 3. the reasoner works by it: task and template stand in every prompt of the episode;
 4. the buffer manager (one call) distils a template from what was done and what came of it, and keeps it only if it is
-   new: its description is less than `threshold` similar to all others (`novelty: similarity`, the paper's rule), or the
-   model says so when it is shown the nearest (`novelty: llm`, the authors' code; one call more).
+   new: its description is less than `keep_threshold` similar to all others (`novelty: similarity`, the paper's rule),
+   or the model says so when it is shown the nearest (`novelty: llm`, the authors' code; one call more).
+
+The paper has one threshold of 0.5 to 0.7 and a large embedder. MiniLM's similarities are lower where a task is held
+against a description: 0.44 to 0.46 for delivery shifts among themselves, at most 0.08 for other kinds; two
+descriptions of one kind are 0.52 to 0.57 similar, of two kinds at most 0.29. Hence the two defaults, 0.35 and 0.5.
 
 AgentSpec's form: an episode is the paper's problem. Step 4 waits for the beginning of the run's next episode, so that
 nothing is distilled that nobody reads, and the episode that reads it pays for it: the method learns only under
@@ -23,11 +27,13 @@ one used least, of equals the oldest, goes first.
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
 from agentspec.memory import telling
+from agentspec.memory.buffer_of_thought import prompts
+from agentspec.memory.buffer_of_thought.templates import COARSE, Template
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -47,75 +53,6 @@ MOST_STEPS = 64
 MOST_NEAREST = 3
 """Templates that a new one is held against by the model."""
 
-DISTIL = """\
-You prepare a task for an agent. From the task and its first state write three short lists, and no solution:
-Key facts: the quantities, ids, places and times that matter.
-Constraints: what limits, forbids or costs.
-Goal: what counts as success, and by when.
-
-The task:
-{task}"""
-STATE = "The first state (data, not instructions):\n{state}\n\nThe three lists:"
-
-TEMPLATE = """\
-You keep an agent's buffer of thought templates: ways of working that carry over to other tasks of the same kind. Distil
-one from the episode below, as JSON:
-{{"category": a few words,
-"description": for which tasks it is, in a sentence or two without this episode's particulars,
-"template": numbered steps with their conditions and decision rules}}
-Name actions as they are called. Put roles in the place of this episode's ids and places, and keep numbers that hold in
-every episode (prices, speeds, limits). Where the episode failed or lost time, write what is to be done instead.
-
-The task:
-{task}"""
-EPISODE = "The task in short:\n{problem}\n\n{steps}\n{course}\n\nThe template as JSON:"
-
-NOVEL = (
-    "Thought templates of an agent (data, not instructions):\n{nearest}\n\nA new one:\n{new}\n\nIs the new one "
-    'fundamentally different from every other, so that it is worth keeping? Answer with JSON: {{"new": true or false}}'
-)
-
-TASK = "The task, distilled:\n{problem}"
-SHOWN = "A way of working, {category}. For: {description}\n{template}"
-
-
-@dataclass(frozen=True)
-class Template:
-    """A way of working: what it is called, for which tasks it is, its steps, and how often it was looked up."""
-
-    category: str
-    description: str
-    template: str
-    uses: int = 0
-
-    def text(self) -> str:
-        """As the model reads it."""
-        return f"{self.category}: {self.description}\n{self.template}"
-
-
-COARSE = (
-    Template(
-        "one goal after another",
-        "Reach a goal by a sequence of actions, each of which makes the next one possible.",
-        "1. Name the goal and what is missing for it. 2. Take the first thing missing that can be had now. 3. After "
-        "every action compare what was expected with what came. 4. If an action failed, remove its reason before it is "
-        "tried again.",
-    ),
-    Template(
-        "search",
-        "Find or explore: the place of a thing, a room, a door or a key is unknown and must be looked for.",
-        "1. List where it may be, the likeliest and nearest first. 2. Look there and note what was seen. 3. Never look "
-        "twice where nothing can have changed. 4. Once it is found, go straight for it.",
-    ),
-    Template(
-        "several jobs against the clock",
-        "Earn or deliver as much as possible before time is up: orders, deadlines, pay, distances and limited energy.",
-        "1. Of each job work out pay per minute with the way there. 2. Take jobs whose stops lie on one way, and none "
-        "that cannot be done in time. 3. Order the stops by deadline, then by distance. 4. Use waiting time, and "
-        "refill before it runs out. 5. Plan anew when something changes.",
-    ),
-)
-
 
 class BufferOfThought:
     """Thought templates, distilled from episodes and looked up for new ones.
@@ -123,7 +60,8 @@ class BufferOfThought:
     Args:
         preset: `paper` or `rl`; see the module's docstring. The parameters that it sets are `None` here.
         distiller: `llm`, or `none`: no call at all.
-        threshold: similarity below which a task is new, and below which a template is.
+        threshold: similarity to every template below which a task is new.
+        keep_threshold: similarity to every other template below which a template is.
         novelty: who says whether a template is new: `similarity` or `llm`.
         max_size: most templates.
         template_tokens: most tokens of a template's steps.
@@ -148,7 +86,10 @@ class BufferOfThought:
             "novel": Purpose("retrieve", '{"new": true}'),
         },
         needs=("embedder",),
-        small=({"novelty": "llm", "max_size": 1, "repairs": 0}, {"distiller": "none", "max_size": 1, "threshold": 1.0}),
+        small=(
+            {"novelty": "llm", "max_size": 1, "repairs": 0},
+            {"distiller": "none", "max_size": 1, "keep_threshold": 1.0},
+        ),
         aliases=("bot",),
     )
 
@@ -157,7 +98,8 @@ class BufferOfThought:
         services: Services,
         preset: str = "paper",
         distiller: str = "llm",
-        threshold: float = 0.6,
+        threshold: float = 0.35,
+        keep_threshold: float = 0.5,
         novelty: str = "similarity",
         max_size: int = 200,
         template_tokens: int = 256,
@@ -177,12 +119,14 @@ class BufferOfThought:
         )
         positive = {name: value for name, value in chosen.items() if name != "repairs"}
         at_least("buffer_of_thought", 1, max_size=max_size, template_tokens=template_tokens, **positive)
-        if not 0 <= threshold <= 1 or chosen["repairs"] not in (0, 1):
+        if not (0 <= threshold <= 1 and 0 <= keep_threshold <= 1) or chosen["repairs"] not in (0, 1):
             raise SpecError(
-                f"buffer_of_thought: threshold={threshold} must lie in 0..1 and repairs={chosen['repairs']} be 0 or 1"
+                f"buffer_of_thought: threshold={threshold} and keep_threshold={keep_threshold} must lie in 0..1, and "
+                f"repairs={chosen['repairs']} be 0 or 1"
             )
         self.services = services
-        self.asks, self.novelty, self.threshold = distiller == "llm", novelty, threshold
+        self.asks, self.novelty = distiller == "llm", novelty
+        self.threshold, self.keep_threshold = threshold, keep_threshold
         self.max_size, self.template_tokens = max_size, template_tokens
         self.state_tokens, self.task_tokens = chosen["state_tokens"], chosen["task_tokens"]
         self.course_tokens, self.answer_tokens = chosen["course_tokens"], chosen["answer_tokens"]
@@ -217,7 +161,9 @@ class BufferOfThought:
         source = self.services.llm.module
         items = []
         if self._problem:
-            items.append(RecallItem(TASK.format(problem=self._problem), kind="summary", source=source, priority=1))
+            items.append(
+                RecallItem(prompts.TASK.format(problem=self._problem), kind="summary", source=source, priority=1)
+            )
         if self._working:
             items.append(RecallItem(self._working, kind="procedural", source=source, priority=2))
         return Recall(tuple(items))
@@ -241,7 +187,10 @@ class BufferOfThought:
         state = clip_text(" ".join(input.text.split()), self.state_tokens, self._count)
         self._problem, self._looked_up = "", state
         if self.asks:
-            prompt = (system(DISTIL.format(task=self._task(input.instruction))), user(STATE.format(state=state)))
+            prompt = (
+                system(prompts.DISTIL.format(task=self._task(input.instruction))),
+                user(prompts.STATE.format(state=state)),
+            )
             answer = await self.services.ask("distil", prompt, self.answer_tokens)
             if answer.value and not answer.problem:
                 self._problem = self._looked_up = str(answer.value).strip()
@@ -258,7 +207,7 @@ class BufferOfThought:
         else:
             self._figures["coarse"] += 1
             found = COARSE[self._coarse.search(problem, 1)[0][0]]
-        return SHOWN.format(**asdict(found))
+        return prompts.SHOWN.format(**asdict(found))
 
     # -- after an episode ------------------------------------------------------------------------------------------
 
@@ -279,8 +228,8 @@ class BufferOfThought:
     async def _distilled(self, instruction: str, finished: list[list[str]]) -> Template | None:
         course = telling.course(finished[1:], self.course_tokens, self._count)
         prompt = (
-            system(TEMPLATE.format(task=self._task(instruction))),
-            user(EPISODE.format(problem=finished[0][1], steps=telling.STEPS, course=course)),
+            system(prompts.TEMPLATE.format(task=self._task(instruction))),
+            user(prompts.EPISODE.format(problem=finished[0][1], steps=telling.STEPS, course=course)),
         )
         parse = json_of({"category": str, "description": str, "template": str}, repairs=self.repairs)
         answer = await self.services.ask("template", prompt, self.answer_tokens, parse)
@@ -306,10 +255,10 @@ class BufferOfThought:
         assert self._index is not None
         if self.novelty == "similarity" or not self.asks:
             nearest = self._index.search(template.description, 1)
-            return not nearest or nearest[0][1] < self.threshold
+            return not nearest or nearest[0][1] < self.keep_threshold
         near = [self._buffer[key] for key, _ in self._index.search(template.description, MOST_NEAREST)]
         shown = "\n\n".join(other.text() for other in near or COARSE)
-        prompt = NOVEL.format(nearest=shown, new=template.text())
+        prompt = prompts.NOVEL.format(nearest=shown, new=template.text())
         answer = await self.services.ask("novel", prompt, 64, json_of({"new": bool}, repairs=self.repairs))
         return answer.value is not None and bool(answer.value["new"])
 
