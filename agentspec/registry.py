@@ -89,8 +89,10 @@ class Entry:
         return self.declaration.presets
 
     def needs_with(self, params: Mapping[str, Any]) -> tuple[str, ...]:
-        """What the method needs when it is built with `params`."""
-        return self.declaration.needs_with(params)
+        """What the method needs when it is built with `params`: those left out have the constructor's defaults."""
+        signature = inspect.signature(self.load()).parameters
+        defaults = {name: p.default for name, p in signature.items() if p.default is not inspect.Parameter.empty}
+        return self.declaration.needs_with({**defaults, **params})
 
     def load(self) -> Any:
         """Import the target."""

@@ -1,4 +1,4 @@
-"""What memories of short notes share: notes that are found by meaning, steps that wait to become notes, and how both read.
+"""What memories of short notes share: notes found by meaning, steps that wait to become notes, and how both read.
 
 A note says what is so in the environment's terms, and when that was seen: time is counted in environment steps, never
 by a wall clock. A memory that asks the model about several steps holds them as `Step`s until they are notes; what is
@@ -11,6 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from agentspec.protocols import Embedder, Services
 from agentspec.registry import SpecError
@@ -133,6 +136,10 @@ class Entries:
             return []
         allowed = None if where is None else lambda id: where(self._by_id[id])
         return [(self._by_id[id], score) for id, score in self._words.search(query, k, where=allowed)]
+
+    def embed(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """Unit vectors, shape (len(texts), dim)."""
+        return self._vectors.embedder.embed(list(texts))
 
     def cosine(self, a: int, b: int) -> float:
         """Cosine similarity of two notes."""
