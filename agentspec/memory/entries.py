@@ -75,7 +75,7 @@ class Entries:
     Args:
         embedder: text -> unit vector.
         capacity: most notes; beyond, the one that was written or confirmed longest ago is forgotten.
-        words: whether `by_words` is used.
+        words: whether `by_words` is used; it also searches `data["keywords"]`.
     """
 
     def __init__(self, embedder: Embedder, capacity: int, *, words: bool = False) -> None:
@@ -101,7 +101,7 @@ class Entries:
         self._by_id[entry.id] = entry
         self._vectors.put(entry.id, entry.text)
         if self._words is not None:
-            self._words.put(entry.id, entry.text)
+            self._words.put(entry.id, _searched(entry))
         while len(self._by_id) > self.capacity:
             oldest = min(self._by_id.values(), key=lambda e: e.time.total)
             self.remove(oldest.id)
@@ -141,6 +141,10 @@ class Entries:
         """Unit vectors, shape (len(texts), dim)."""
         return self._vectors.embedder.embed(list(texts))
 
+    def similarity(self, query: str, id: int) -> float:
+        """Cosine similarity of a text and a note."""
+        return float(self._vectors.vector(id) @ self._vectors.embedder.embed([query])[0])
+
     def cosine(self, a: int, b: int) -> float:
         """Cosine similarity of two notes."""
         return float(self._vectors.vector(a) @ self._vectors.vector(b))
@@ -157,7 +161,12 @@ class Entries:
         if self._words is not None:
             self._words = Lexical()
             for e in self:
-                self._words.put(e.id, e.text)
+                self._words.put(e.id, _searched(e))
+
+
+def _searched(entry: Entry) -> str:
+    """The words that a note is found by: its text's, and its keywords."""
+    return " ".join((entry.text, *entry.data.get("keywords", ())))
 
 
 class NoEmbedder:

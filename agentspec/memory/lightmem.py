@@ -235,7 +235,8 @@ class LightMemory:
         block = replace(seen, state=state).block(self.step_tokens, self.services.llm.count_tokens)
         self.sensory.append(replace(step, text=block))
         self._lines = [*self._lines, step.line][-MOST_LINES:]
-        if self._tokens(self.sensory) >= self.sensory_tokens:
+        ended = transition.terminated or transition.truncated
+        if self._tokens(self.sensory) >= self.sensory_tokens and not ended:
             await self._segment(transition.input.instruction)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
