@@ -1,8 +1,8 @@
 """SimpleMem (Liu et al., 2026, arXiv 2601.02553): notes that need no context, merged when alike, found in three ways.
 
 1. *Compression.* A step passes the gate if it holds something new: `weight` times the share of its names and numbers
-   that the steps before did not have, plus `1 - weight` times its dissimilarity to them, is at least `gate` (or it
-   earned or cost something). Of every `window` steps that passed, and the last `overlap` before them, one call writes
+   that the steps before did not have, plus `1 - weight` times its dissimilarity to them, is at least `gate`, for its
+   state or for what was done and came of it; or it earned or cost something. Of every `window` steps that passed, and the last `overlap` before them, one call writes
    notes: each understood by itself, without pronouns, with absolute times, and with keywords, place, entities and
    topic. The newest `context` notes are shown, so that nothing is written twice.
 2. *Consolidation.* Two notes have affinity `beta * cosine + (1 - beta) * exp(-decay * steps between them)`. Where a new
@@ -236,7 +236,7 @@ class SimpleMemory:
         self._named: dict[str, dict[int, None]] = {}  # place or entity -> notes that name it
         self._window: list[Step] = []  # the overlap, then the steps that are not notes yet
         self._new = 0  # how many of these are new
-        self._before: list[str] = []  # what the gate compares with
+        self._before: list[list[str]] = []  # what the gate compares with: states, and what was done in them
         self._lines: list[str] = []
         self._left = False
         self._dropped = 0
@@ -323,11 +323,12 @@ class SimpleMemory:
     async def store(self, transition: Transition) -> None:
         step = Step.of(transition, self.services, self.step_tokens)
         self._lines = [*self._lines, step.line][-max(1, self.recent, self.window) :]
-        seen = f"{transition.input.text}\n{step.line.partition('. ')[2]}"
-        novel = self.novelty(seen) >= self.gate or bool(transition.reward)
+        parts = [transition.input.text, step.line.partition(". ")[2]]
+        novelty = max(self.novelty(part, [b[i] for b in self._before]) for i, part in enumerate(parts))
+        novel = novelty >= self.gate or bool(transition.reward)
         self._dropped += not novel
         if novel:
-            self._before = [*self._before, seen][-self.window :]
+            self._before = [*self._before, parts][-self.window :]
             self._window = [*self._window, step][-2 * self.window - self.overlap :]
             self._new = min(self._new + 1, len(self._window))
         if self._new >= self.window and not (transition.terminated or transition.truncated):
@@ -336,14 +337,14 @@ class SimpleMemory:
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is compressed when the next episode of the run begins."""
 
-    def novelty(self, text: str) -> float:
-        """How new a text is, against the last steps that passed: 0 (seen before) to 1."""
-        if not self._before:
+    def novelty(self, text: str, before: list[str]) -> float:
+        """How new a text is beside others: 0 (one of them) to 1 (also where there are none)."""
+        if not before:
             return 1.0
-        known = {name for before in self._before for name in _NAME.findall(before)}
+        known = {name for other in before for name in _NAME.findall(other)}
         names = set(_NAME.findall(text))
         fresh = len(names - known) / max(1, len(names))
-        vectors = self.entries.embed([text, *self._before])
+        vectors = self.entries.embed([text, *before])
         nearest = min(1.0, max(float(vectors[0] @ other) for other in vectors[1:]))
         return self.weight * fresh + (1 - self.weight) * (1 - nearest)
 

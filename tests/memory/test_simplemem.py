@@ -30,19 +30,19 @@ def test_the_gate_drops_what_was_seen_before_and_lets_rewards_pass() -> None:
     bench.step("Mill 5 is open", "GO()", "went")  # the same again: novelty 0
     assert bench.memory.metrics()["dropped"] == 1
     bench.step("Mill 5 is open", "GO()", "went", reward=1.0)
-    bench.step("Port 7 is shut", "GO()", "went")
+    bench.step("Port 7 is shut", "GO()", "went")  # another state
+    bench.step("Port 7 is shut", "GO()", error="the ferry is gone")  # the same state, another result
     assert bench.memory.metrics()["dropped"] == 1
-    assert [s.time.step for s in bench.memory._window] == [0, 2, 3]
+    assert [s.time.step for s in bench.memory._window] == [0, 2, 3, 4]
 
 
 def test_novelty_is_the_weighted_mean_of_new_names_and_dissimilarity() -> None:
     world = Rows({"Mill": [1.0, 0.0], "Port": [0.8, 0.6]})
-    bench = Bench({**NAME, "window": 9, "weight": 0.25}, embedder=world)
-    assert bench.memory.novelty("Mill 5") == 1.0  # nothing to compare with
-    bench.step("Mill 5", "go", "went")
+    memory = Bench({**NAME, "weight": 0.25}, embedder=world).memory
+    assert memory.novelty("Mill 5", []) == 1.0  # nothing to compare with
     # Names of "Port 5" are Port and 5, one of two new; cosine 0.8: 0.25 * 0.5 + 0.75 * 0.2.
-    assert bench.memory.novelty("Port 5") == pytest.approx(0.275, abs=1e-6)
-    assert bench.memory.novelty("Mill 5") == pytest.approx(0.0, abs=1e-6)
+    assert memory.novelty("Port 5", ["Mill 5"]) == pytest.approx(0.275, abs=1e-6)
+    assert memory.novelty("Mill 5", ["Mill 5"]) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_windows_overlap_and_the_newest_notes_are_shown() -> None:
