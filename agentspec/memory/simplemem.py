@@ -2,9 +2,10 @@
 
 1. *Compression.* A step passes the gate if it holds something new: `weight` times the share of its names and numbers
    that the steps before did not have, plus `1 - weight` times its dissimilarity to them, is at least `gate`, for its
-   state or for what was done and came of it; or it earned or cost something. Of every `window` steps that passed, and the last `overlap` before them, one call writes
-   notes: each understood by itself, without pronouns, with absolute times, and with keywords, place, entities and
-   topic. The newest `context` notes are shown, so that nothing is written twice.
+   state or for what was done and came of it; or it earned or cost something. Of every `window` steps that passed, and
+   the last `overlap` before them, one call writes notes: each understood by itself, without pronouns, with absolute
+   times, and with keywords, place, entities and topic. The newest `context` notes are shown, so that nothing is written
+   twice.
 2. *Consolidation.* Two notes have affinity `beta * cosine + (1 - beta) * exp(-decay * steps between them)`. Where a new
    note and others reach `affinity`, at least `cluster` of them, one call writes a single note for all; these go into
    the archive, which is not searched.
