@@ -14,8 +14,8 @@
 AgentSpec's form: one agent, so rules are not projected on roles. Retrieval happens once, before the first decision, and
 so does the learning from the episode before: what no later episode reads is not asked. Numbers are kept (upstream
 strips digits, and merges into a ninth as many rules, by a slip). Success is what the environment says, or a return of
-at least `threshold`; where neither is given, a return above the best so far. Where there are only successes or only failures,
-these are compared among themselves. Within the first episode of a run the memory holds nothing but, in layout
+at least `threshold`; where neither is given, a return above the best so far. Where there are only successes or only
+failures, these are compared among themselves. Within the first episode of a run the memory holds nothing but, in layout
 `snapshot`, the newest steps. Of the paper's tables this is the row *ReAct + G-Memory* (preset `paper`).
 
 Bounded by `capacity` episodes (the oldest goes first) and `max_insights` rules. An answer that cannot be read: no key
