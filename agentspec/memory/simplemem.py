@@ -31,6 +31,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
@@ -453,7 +454,7 @@ class SimpleMemory:
         self._rename()
 
 
-def _data(note: Note) -> dict[str, object]:
+def _data(note: Note) -> dict[str, Any]:
     """What is kept of a note beside its text; places and entities as they are looked up."""
     names = [" ".join(_WORD.findall(name.casefold())) for name in [note.place or "", *note.entities]]
     return {"keywords": note.keywords, "names": list(dict.fromkeys(n for n in names if n)), "topic": note.topic or ""}
