@@ -32,6 +32,7 @@ OURS = {
     "agent and world": "agent environment train_tasks memory_carry start_memory retries env_timeout_s "
     "rollout_concurrency batching",
     "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
+    "write_credit write_calls write_rerolls write_points "
     "normalize overlong overlong_ends mask_truncated packing tokens_per_forward",
     "evaluation": "eval_tasks eval_specs eval_sampling validation_tasks validation_specs",
     "this run": "resume plots",

@@ -60,6 +60,11 @@ class ScaffoldConfig(GRPOConfig):
             of its `best`. All rollouts of a task start from the same memory; tasks share none.
         start_memory: with `scope: run`, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
+        write_credit: what trained calls of memory earn, a name in `trainers.writes.WRITE_CREDITS`: what the
+            ``episode`` does, ``local`` re-rolls with and without the write, or the ``ablation`` of the whole memory.
+        write_calls: patterns of the calls that write (those of memory; narrow it to leave out what only recalls).
+        write_rerolls: with ``local``: re-rolls with, and as many without, each write that is looked at.
+        write_points: with ``local``: most writes of an episode that are looked at; the others earn 0.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
@@ -110,6 +115,10 @@ class ScaffoldConfig(GRPOConfig):
     mask_truncated: list[str] = field(default_factory=list)
     memory_carry: str = "first"
     start_memory: str = ""
+    write_credit: str = "episode"
+    write_calls: list[str] = field(default_factory=lambda: ["memory.*"])
+    write_rerolls: int = 2
+    write_points: int = 1
     retries: int = 0
     env_timeout_s: float = 60.0
     rollout_concurrency: int = 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,11 +29,14 @@ from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
+from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
+from trainers.counterfactuals import play_beside
+from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.losses import UpdateSize, loss
-from trainers.micro_batches import ROWS, collate, padding_row, partition
+from trainers.micro_batches import PADDED, ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
 from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
@@ -139,7 +143,11 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             memory=self._memory,
         )
         with self._current_weights():
-            return self._play(jobs)
+            episodes = self._play(jobs)
+            if self.credit_rule.writes.spec.function is None:
+                return episodes
+            runner = replace(self._runner(self.args.spec), progress=None)
+            return play_beside(runner, jobs, episodes, self.credit_rule, retries=self.args.retries)
 
     def _runner(self, spec: AgentSpec) -> Runner:
         """Runs episodes of `spec` with the policy as it is."""
@@ -228,10 +236,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
+        counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
+        padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []
         for rows in micro_batches:
             batch: dict[str, Any] = collate(rows, self._tokenizer.pad_token_id, device)
-            batch |= {ROWS: rows, "num_items_in_batch": denominator}
+            batch |= {ROWS: rows, "num_items_in_batch": denominator, PADDED: padded}
             if self._off_policy:
                 batch["old_per_token_logps"] = batch["sampled_logprobs"]
             if self.beta != 0.0:
@@ -251,6 +261,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         for name, value in figures.items():
             self._metrics["train"][name].append(value)
         self.run_log.trajectories(self._round, self.accelerator.process_index, episodes)
+        if beside := counterfactuals(self._played):
+            self.run_log.trajectories(self._round, self.accelerator.process_index, beside, COUNTERFACTUALS)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""

@@ -93,6 +93,7 @@ class LossSpec:
         clipped: which tokens lose their gradient to clipping; arguments as of `objective`.
         uses: settings of the configuration that it reads.
         depends_on_rows: how it depends on the way episodes split into rows; empty if it does not.
+        row_mean: whether it is a mean over rows; padding rows, which TRL would count, are none.
     """
 
     name: str
@@ -103,6 +104,7 @@ class LossSpec:
     clipped: Objective = pushed_outside
     uses: tuple[str, ...] = ("epsilon", "epsilon_high", "delta")
     depends_on_rows: str = ""
+    row_mean: bool = False
 
     @property
     def per_token(self) -> bool:
@@ -141,6 +143,7 @@ LOSSES: dict[str, LossSpec] = {
             trl="grpo",
             depends_on_rows="each row has the same weight, so an episode of three rows counts three times one of "
             "a single row",
+            row_mean=True,
         ),
         LossSpec(
             "bnpo",

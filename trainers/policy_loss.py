@@ -17,7 +17,7 @@ from trainers.distributed import is_sharded
 from trainers.finite import require_finite
 from trainers.forward import rows_logprobs
 from trainers.losses import divergence
-from trainers.micro_batches import ROWS
+from trainers.micro_batches import PADDED, ROWS
 from trainers.sequences import Row
 from trainers.vllm import importance_ratio
 
@@ -66,6 +66,8 @@ class PolicyLoss(Base):
         try:
             compute = self._own_loss if self.loss_spec.objective else super()._compute_loss
             value: torch.Tensor = compute(model, inputs)
+            if self.loss_spec.row_mean:  # TRL's mean counts padding rows, whose share depends on the partition
+                value = value * inputs[PADDED]
         finally:
             self._current = None
         require_finite("loss", [(self.args.loss_type, value.detach())], self.state.global_step)

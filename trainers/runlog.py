@@ -10,8 +10,8 @@
         seal.json                 written when the run ends: its digest is the head of the chain
 
 A receipt holds the digests of its round's trajectory files, of the manifest and of the receipt before it; the seal
-holds those of the last receipt and of all logged lines. Whoever keeps the head can tell any later edit. Without it, an
-edit is told as long as its author does not compute every digest after it anew.
+holds those of the last receipt and of all logged lines, and how many bytes these files have. Whoever keeps the head can
+tell any later edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
 """
 
 from __future__ import annotations
@@ -151,10 +151,12 @@ def manifest_digest(folder: Path) -> str:
 def seal_of(folder: Path) -> dict[str, Any]:
     """What a run's seal must hold."""
     logs = {name: [digest(line)[:16] for _, line in whole_lines(folder / name)] for name in LOGGED}
+    sizes = {name: (folder / name).stat().st_size for name in (UPDATES, *LOGGED) if (folder / name).is_file()}
     return {
         "format": FORMAT,
         "updates": sum(1 for _ in whole_lines(folder / UPDATES)),
         "last_receipt": last_digest(folder),
         "manifest": manifest_digest(folder),
         "logs": {name: lines for name, lines in logs.items() if lines},
+        "sizes": sizes,
     }

@@ -177,6 +177,12 @@ NAMED = {
     "a trajectory file deleted": "trajectories/000000.jsonl is missing",
     "a trajectory file added": "trajectories/000900.jsonl: no receipt names it",
     "bytes that read the same": "trajectories/000001.jsonl or its digest .*; its records read as before",
+    "a trajectory file of another name added": "trajectories/more.jsonl: no receipt names it",
+    **{
+        f"a {what} line in {name}": rf"{name} has \d+ bytes, seal.json says \d+ \(`sizes`\)"
+        for what in ("torn", "blank")
+        for name in ("updates.jsonl", "metrics.jsonl", "evaluations.jsonl")
+    },
 }
 
 
