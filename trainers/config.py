@@ -61,10 +61,10 @@ class ScaffoldConfig(GRPOConfig):
         start_memory: with `scope: run`, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
         write_credit: what trained calls of memory earn, a name in `trainers.writes.WRITE_CREDITS`: what the
-            ``episode`` does, ``local`` re-rolls with and without the write, or the ``ablation`` of the whole memory.
+            `episode` does, `local` re-rolls with and without the write, or the `ablation` of the whole memory.
         write_calls: patterns of the calls that write (those of memory; narrow it to leave out what only recalls).
-        write_rerolls: with ``local``: re-rolls with, and as many without, each write that is looked at.
-        write_points: with ``local``: most writes of an episode that are looked at; the others earn 0.
+        write_rerolls: with `local`: re-rolls with, and as many without, each write that is looked at.
+        write_points: with `local`: most writes of an episode that are looked at; the others earn 0.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).

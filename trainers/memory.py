@@ -1,7 +1,7 @@
 """A memory trained with its policy, as a configuration: what memory asks is among the trained calls.
 
-There is no second trainer. What the policy writes into memory are rows like any other (:mod:`trainers.sequences`); what
-they earn is `write_credit` (:mod:`trainers.writes`). This module checks that a configuration trains a memory and fills
+There is no second trainer. What the policy writes into memory are rows like any other (`trainers.sequences`); what
+they earn is `write_credit` (`trainers.writes`). This module checks that a configuration trains a memory and fills
 in what follows from it.
 """
 
