@@ -128,9 +128,9 @@ def diff(one: MemoryBank, other: MemoryBank, task: str = "") -> list[str]:
     for key in shared:
         pairs.append((key, mine[key], theirs[key]))
     if not shared:
-        last = [bank.states.get(bank.latest, bank.start) for bank in (one, other)]
-        pairs.append(("latest", *last))
-    lines = []
+        first, second = (bank.states.get(bank.latest, bank.start) for bank in (one, other))
+        pairs.append(("latest", first, second))
+    lines: list[str] = []
     for key, before, after in pairs:
         a, b = (_flat(bank, state) if state else [] for bank, state in ((one, before), (other, after)))
         lines += difflib.unified_diff(a, b, f"{key} (first)", f"{key} (second)", lineterm="", n=1)

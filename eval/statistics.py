@@ -214,7 +214,7 @@ def _welch(a: Values, b: Values, level: float) -> Estimate:
     if np.ptp(x) <= noise and np.ptp(y) <= noise:
         return Estimate(mean, mean, mean, min(n for n in (x.size, y.size) if n > 1), "run", float(abs(mean) <= noise))
     if y.size == 1:
-        estimate = mean_interval(x - y, level=level, unit="run")
+        estimate = mean_interval([float(gain) for gain in x - y], level=level, unit="run")
         return replace(estimate, p=float(stats.ttest_1samp(x - y, 0.0).pvalue))
     found = stats.ttest_ind(x, y, equal_var=False)
     interval = found.confidence_interval(confidence_level=level)
