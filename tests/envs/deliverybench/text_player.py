@@ -28,6 +28,8 @@ Point = tuple[float, float]
 SECOND, METRE = 0.05, 0.003
 """What a second and a metre are worth (dollars): about what an hour of good work brings."""
 STOP_S = 4.0
+COOKING_S = 240.0
+"""Of an order that is only on offer: the middle of what the rules say."""
 BONUS = 2.0
 """Expected tip of an order in time ("up to $3 for five stars")."""
 GAIN = 0.5
@@ -52,7 +54,6 @@ class Order:
     carried: bool
     pickup: Point
     dropoff: Point
-    way: float
 
 
 @dataclass(frozen=True)
@@ -113,15 +114,20 @@ def own_order(line: str) -> Order:
         carried=carried,
         pickup=point(pickup, 1),
         dropoff=point(in_person or drop, 1),
-        way=0.0 if carried else float(must(r"from there (\d+)m", line)[1]),
     )
 
 
 def offered(line: str) -> Order:
-    found = must(rf"^order (\d+): \$([\d.]+), (\d+)m, (\d+) min\. From .*?{_AT}.* to {_AT}", line)
-    number, pay, way, limit = found.group(1, 2, 3, 4)
-    # How long the kitchen needs is not told; a few minutes.
-    return Order(int(number), float(pay), float(limit) * 60.0, 240.0, False, point(found, 5), point(found, 7), float(way))
+    found = must(rf"^order (\d+): \$([\d.]+), \d+m, {_TIME}\. From .*?{_AT}.* to {_AT}", line)
+    return Order(
+        id=int(found[1]),
+        pay=float(found[2]),
+        left=seconds(found[3]),
+        ready=COOKING_S,
+        carried=False,
+        pickup=point(found, 4),
+        dropoff=point(found, 6),
+    )
 
 
 def scene(text: str) -> Scene:
@@ -213,8 +219,13 @@ def wanted(seen: Scene, stops: list[Stop], speed: float) -> list[int]:
 # -- acting ------------------------------------------------------------------------------------------------------------
 
 
-def move(goal: Point, pace: str = "") -> str:
-    return f"MOVE({goal[0]}m, {goal[1]}m{pace})"
+def move(goal: Point) -> str:
+    return f"MOVE({goal[0]}m, {goal[1]}m)"
+
+
+def visit(where: tuple[Point, float], there: str) -> str:
+    """Go to a place, and do something there."""
+    return move(where[0]) if where[1] else there
 
 
 def call_in(hint: str) -> str:
@@ -228,30 +239,35 @@ def hint(seen: Scene, *beginnings: str) -> str | None:
     return None if found is None else call_in(found)
 
 
-def errand(seen: Scene) -> str | None:
-    """Energy and vehicle."""
-    store, rental = seen.nearest.get("store"), seen.nearest.get("car_rental")
-    drinks = seen.goods.get("energy_drink", 0)
+def strength(seen: Scene) -> str | None:
+    """Drink when tired; keep two drinks."""
+    drinks, store = seen.goods.get("energy_drink", 0), seen.nearest.get("store")
     if seen.energy <= 50.0 and drinks:
         return "USE_ENERGY_DRINK()"
-    if store and drinks < 2 and seen.balance >= 12.0 and (seen.energy <= TIRED or (not store[1] and seen.left > 900.0)):
-        return move(store[0]) if store[1] else 'BUY(item_id="energy_drink", qty=2)'
-    fetch_car = rental and not seen.car and seen.left >= CAR_FROM_S + rental[1] / 6.0 and seen.balance >= 30.0
-    if rental and fetch_car and not any(order.carried for order in seen.orders):
-        return move(rental[0]) if rental[1] else "RENT_CAR()"
+    if store is None or drinks >= 2 or seen.balance < 12.0:
+        return None
+    passing = not store[1] and seen.left > 900.0
+    return visit(store, 'BUY(item_id="energy_drink", qty=2)') if passing or seen.energy <= TIRED else None
+
+
+def vehicle(seen: Scene) -> str | None:
+    """A car while it pays, else the scooter with a charged battery."""
+    store, rental = seen.nearest.get("store"), seen.nearest.get("car_rental")
+    if rental and not seen.car and seen.left >= CAR_FROM_S + rental[1] / 6.0 and seen.balance >= 30.0:
+        return visit(rental, "RENT_CAR()")
     if seen.mode == "on foot":
         return hint(seen, "your car stands here", "your scooter stands here")
-    if seen.mode != "in the rented car" and seen.range < LOW_M and store:
-        if seen.goods.get("escooter_battery_pack"):
-            return "USE_BATTERY_PACK()"
-        if seen.balance >= 15.0 and seen.left > 300.0:
-            return move(store[0]) if store[1] else 'BUY(item_id="escooter_battery_pack", qty=2)'
-    return None
+    if seen.car or seen.range >= LOW_M or store is None:
+        return None
+    if seen.goods.get("escooter_battery_pack"):
+        return "USE_BATTERY_PACK()"
+    worthwhile = seen.balance >= 15.0 and seen.left > 300.0
+    return visit(store, 'BUY(item_id="escooter_battery_pack", qty=1)') if worthwhile else None
 
 
 def decide(seen: Scene) -> str:
     """The next action."""
-    urgent = hint(seen, "deliver", "pack", "fetch") or errand(seen)
+    urgent = hint(seen, "deliver", "pack", "fetch") or strength(seen) or vehicle(seen)
     if urgent:
         return urgent
     speed = 12.0 if seen.car else 6.0
