@@ -56,7 +56,8 @@ class Due:
 
 @dataclass(frozen=True)
 class Pending:
-    """A lesson whose worth is not known yet: which call of which trial wrote it, and that trial's return."""
+    """A lesson whose worth is not known yet: which call of which trial wrote it (-1: none, it is the `control`), and
+    that trial's return."""
 
     episode: str
     trial: int
@@ -159,8 +160,15 @@ class Retroformer(Reflexion):
             return None
         return await self._write(log, due)
 
-    async def _write(self, log: TrialLog, due: Due) -> LLMCall:
-        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other."""
+    async def _write(self, log: TrialLog, due: Due) -> LLMCall | None:
+        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other.
+
+        A `control` takes its place at the same time and is paid the same way, so that trials compare like with like.
+        """
+        if self.control:
+            self._pending[self._key] = Pending("", due.trial, -1, due.before)
+            self._learn(log, due.trial, self.control)
+            return None
         sampling = {} if self.temperature is None else {"temperature": self.temperature}
         messages = (system(due.instruction), user(due.request))
         call = await self.services.llm.generate("reflect", messages, max_tokens=self.reflection_tokens, **sampling)

@@ -50,7 +50,8 @@ def full_text(view: View, surrounding: str, plan: str = "", menu: Sequence[Optio
         sections.append(f"Last error: {view['error']}")
     if plan:
         sections.append(f"Your plan: {plan}")
-    news = [notice["text"] for notice in view["notices"] if notice["text"] and notice["kind"] != "bagging"]
+    told = ("bagging", "settled")  # by a hint, and by what the last action did
+    news = [notice["text"] for notice in view["notices"] if notice["text"] and notice["kind"] not in told]
     if news:
         sections.append(listing("News", news, ""))
     if menu:
