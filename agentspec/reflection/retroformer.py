@@ -33,12 +33,12 @@ from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.parameters import one_of
 from agentspec.protocols import Services
-from agentspec.reading import visible
 from agentspec.reflection.reflexion import Reflexion
 from agentspec.reflection.trials import TrialLog, episode_return
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, LLMCall, Recall, Task
+from agentspec.visible import visible
 
 PATH = "reflection.retroformer/reflect"
 WHEN = ("end", "start")
