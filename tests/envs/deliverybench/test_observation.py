@@ -158,7 +158,7 @@ def test_the_rules_tell_what_a_plan_rests_on() -> None:
     # Popsicles take 30 s, curry 420 s; ten orders at a time; after 60 s the pay shrinks, to half at worst.
     assert "the time allowed begins" in text and "starts cooking (1 to 7 min)" in text
     assert "(at most 10)" in text and "From 60s late on the pay shrinks, down to 50 %" in text
-    assert "only moving, waiting, resting and the bus take time" in text
+    assert "Otherwise only moving, waiting, resting and the bus take time" in text
     assert "Smelly: Coffee, Durian, StinkyTofu, BlueCheese." in text and "Fragile: Noodles, Salad" in text
 
 

@@ -108,7 +108,7 @@ def _habits(rules: Rules, compact: bool) -> list[str]:
     board += "them in one action."
     return [
         board,
-        "Of the actions only moving, waiting, resting and the bus take time.",
+        "Otherwise only moving, waiting, resting and the bus take time.",
         "Do not repeat an action that has just failed: read why.",
         "Plan the next stops and keep to the plan until something changes.",
     ]
