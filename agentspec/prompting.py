@@ -60,7 +60,7 @@ def render_actions(schema: ActionSchema) -> str:
 def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "") -> str:
     """Lessons and memory within the spec's budgets, a method's own transcript of the steps, then the observation.
 
-    Steps that the transcript tells are not told again by a memory that is nothing but a list of the newest steps.
+    Steps that the transcript tells are not told again by a memory: `base`, or items of kind `step`.
     """
     if transcript:
         recall = Recall(tuple(item for item in recall.items if not _a_step(item)))
@@ -69,7 +69,7 @@ def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcri
 
 
 def _a_step(item: RecallItem) -> bool:
-    return item.kind == "episodic" and item.source == "memory.base"
+    return item.kind == "step" or (item.kind == "episodic" and item.source == "memory.base")
 
 
 def default_answer(schema: ActionSchema) -> str:

@@ -52,9 +52,10 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     from agentspec.episode import Job, Runner
     from agentspec.files import write_atomic
     from agentspec.spec import ModuleSpec
+    from agentspec.tasks import make_tasks
     from trainers.policy import load_actor_and_reflector
-    from trainers.retroformer import has_lesson, play_trials, routed_llm
-    from trainers.rollouts import make_tasks
+    from trainers.retroformer import ADAPTERS, has_lesson, play_trials
+    from trainers.rollouts import local_llm
 
     name, options = config.world
     jobs = [Job(task, 0, config.seed) for task in make_tasks(name, options, config.eval_tasks, split="test")]
@@ -65,7 +66,9 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     reflectors = (("meaningless lesson", "", without), ("before training", "", spec), ("after training", folder, spec))
     for label, run, agent in reflectors:
         model, tokenizer = load_actor_and_reflector(config, run)
-        runner = Runner(agent, routed_llm(model, tokenizer), timeout_s=config.env_timeout_s, policy=label)
+        runner = Runner(
+            agent, local_llm(model, tokenizer, adapters=ADAPTERS), timeout_s=config.env_timeout_s, policy=label
+        )
         played = play_trials(partial(_unscored, runner), jobs)
         firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):

@@ -26,7 +26,7 @@ from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
-from trainers.credit import Credited, CreditRule, is_overlong
+from trainers.credit import Credited, is_overlong
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
 from trainers.supo import as_supo
@@ -43,7 +43,7 @@ def configured(tmp_path: Path, **changes: Any) -> ScaffoldConfig:
 
 
 def credited(episodes: Sequence[Trajectory], config: ScaffoldConfig) -> Credited:
-    rule = CreditRule.from_config(config)
+    rule = config.credit_rule
     return rule.credit(rule.score(episodes))
 
 
