@@ -22,10 +22,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from agentspec.llm.base import Message, assistant, user
-from agentspec.reading import Reading, read, visible
+from agentspec.reading import Reading, read
 from agentspec.registry import SpecError
 from agentspec.services import Services
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, RecallItem, Sampled
+from agentspec.visible import visible
 
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
 CALL_ANSWER = "Answer with exactly one action call and nothing else."

@@ -374,6 +374,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
             "a lesson and the trial that pays it must be one episode that starts from the failed trial's memory: set "
             f"`reflection: {{name: {REFLECTION}, when: start}}` and `scope: run`"
         )
+    if spec.reflection.params.get("control"):
+        raise SpecError("reflection.control: a fixed text stands for every lesson, so none is sampled; leave it out")
     if spec.reflection.params.get("temperature") == 0:
         raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
     if config.start_memory:

@@ -30,12 +30,12 @@ from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.parameters import one_of
 from agentspec.protocols import Services
-from agentspec.reading import visible
 from agentspec.reflection.reflexion import Reflexion
 from agentspec.reflection.trials import TrialLog, episode_return
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, LLMCall, Recall, Task
+from agentspec.visible import visible
 
 PATH = "reflection.retroformer/reflect"
 WHEN = ("end", "start")
@@ -53,7 +53,8 @@ class Due:
 
 @dataclass(frozen=True)
 class Pending:
-    """A lesson whose worth is not known yet: which call of which trial wrote it, and that trial's return."""
+    """A lesson whose worth is not known yet: which call of which trial wrote it (-1: none, it is the `control`), and
+    that trial's return."""
 
     episode: str
     trial: int
@@ -141,8 +142,15 @@ class Retroformer(Reflexion):
             return None
         return await self._write(log, due)
 
-    async def _write(self, log: TrialLog, due: Due) -> LLMCall:
-        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other."""
+    async def _write(self, log: TrialLog, due: Due) -> LLMCall | None:
+        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other.
+
+        A `control` takes its place at the same time and is paid the same way, so that trials compare like with like.
+        """
+        if self.control:
+            self._pending[self._key] = Pending("", due.trial, -1, due.before)
+            self._learn(log, due.trial, self.control)
+            return None
         sampling = {} if self.temperature is None else {"temperature": self.temperature}
         messages = (system(due.instruction), user(due.request))
         call = await self.services.llm.generate("reflect", messages, max_tokens=self.reflection_tokens, **sampling)

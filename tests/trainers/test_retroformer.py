@@ -313,6 +313,7 @@ def test_the_gain_per_step_sums_to_the_change_of_return() -> None:
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "another reflection": ({"agent": {"reflection": "reflexion"}}, "reflection: retroformer"),
     "lessons at the end": ({"agent": {"reflection": {"name": "retroformer", "when": "end"}}}, "when: start"),
+    "no lessons": ({"agent": {"reflection": {"name": "retroformer", "control": "x"}}}, "none is sampled"),
     "greedy lessons": ({"agent": {"reflection": {"name": "retroformer", "temperature": 0}}}, "temperature is 0"),
     "a trained actor": ({"train_calls": ["reasoning.*", PATH]}, "the actor is frozen"),
     "another reward": ({"rewards": {"earning_delta": 1.0}}, "reflection_gain"),

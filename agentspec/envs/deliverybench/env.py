@@ -330,7 +330,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             return menu_text(view, said, self.menu)
         if self.compact:
             return compact_text(view, last.message)
-        return full_text(view, around(self.city, self.world.state.position, view), self._plan, self.menu)
+        surrounding = around(self.city, self.world.state.position, view)
+        return full_text(view, surrounding, self._plan, self.menu, message=last.message)
 
     def _native(self, text: str) -> tuple[str, str]:
         """The native call for an answer, and in menu mode the problem with an answer that is neither."""

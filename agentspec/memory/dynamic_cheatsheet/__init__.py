@@ -37,10 +37,11 @@ from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex, top_rows
 from agentspec.state import dump_state, load_state
-from agentspec.structured import ParseError, Parser, without_thinking
+from agentspec.structured import ParseError, Parser
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
+from agentspec.visible import visible
 
 PRESETS = {
     "paper": {"every": 1, "top": 3, "sheet_tokens": 2048, "step_tokens": 768, "task_tokens": 1024, "tags": True},
@@ -59,7 +60,7 @@ def read_sheet(text: str, tags: bool = True) -> str:
     Raises:
         ParseError: no complete pair of tags, or nothing in it.
     """
-    text = without_thinking(text)
+    text = visible(text)[0]
     found = _TAGS.findall(text)
     if not found and (tags or _TAG.search(text)):
         raise ParseError("there is no complete <cheatsheet>...</cheatsheet> in it")
