@@ -167,9 +167,9 @@ def markdown(rows: Mapping[str, Mapping[str, Any]], paper: Mapping[str, Any], ab
     lines = [
         "# What memories cost",
         "",
-        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset `{about['preset']}`;",
-        "per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base, median over its backbones",
-        "(least to most).",
+        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset",
+        f"`{about['preset']}`; per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base,",
+        "median over its backbones (least to most).",
         "",
         f"    {about['command']}",
         "",
