@@ -109,6 +109,8 @@ class Services:
         embedder: text embeddings, or `None` where the spec names no embedder.
         new_id: ids of the module, never the same twice in a run.
         simulator: the environment for search, or `None` where it has no snapshots.
+        carried: whether a later episode starts from this one's memory (`scope: run`); otherwise what is written after
+            the last step serves nobody.
     """
 
     llm: ModuleLLM
@@ -118,6 +120,7 @@ class Services:
     embedder: Embedder | None = None
     new_id: Callable[[], int] = field(default_factory=lambda: itertools.count().__next__)
     simulator: Simulator | None = None
+    carried: bool = True
 
     def time(self) -> Time:
         """Episode, step, and steps of the run so far."""
