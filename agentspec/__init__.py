@@ -2,7 +2,7 @@
 
 import os
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # MKL, read when it first multiplies: the same row times the same matrix gives the same bits, however many other rows
 # there are. Without it what is sampled depends, by rounding, on who else is in the batch.

@@ -2,8 +2,8 @@
 
 A name is one of:
 
-- a method of this package: `agentspec/<kind>/<name>.py` (or the folder `<name>/` with an `__init__.py`) holds its class,
-  and the class its declaration (see :mod:`agentspec.declaration`); nothing else is imported to find it;
+- a method of this package: `agentspec/<kind>/<name>.py` (or a folder `<name>` with an `__init__.py`) holds its class,
+  and the class its declaration (see `agentspec.declaration`); nothing else is imported to find it;
 - `package.module:Class`, anybody's;
 - a name of a module that was brought in: by `import_modules` (`--import` on the command line, `imports` in a spec or
   configuration) or by an installed distribution with an entry point in the group `agentspec.modules` (`name =
@@ -79,9 +79,9 @@ class Entry:
         return self.declaration.waived
 
     @property
-    def envs(self) -> tuple[str, ...]:
-        """Environments it is written for; empty: any."""
-        return self.declaration.envs
+    def scripted(self) -> bool:
+        """Whether it plays what an environment's author scripted."""
+        return self.declaration.scripted
 
     @property
     def presets(self) -> dict[str, CallProfile]:
@@ -89,8 +89,10 @@ class Entry:
         return self.declaration.presets
 
     def needs_with(self, params: Mapping[str, Any]) -> tuple[str, ...]:
-        """What the method needs when it is built with `params`."""
-        return self.declaration.needs_with(params)
+        """What the method needs when it is built with `params`: those left out have the constructor's defaults."""
+        signature = inspect.signature(self.load()).parameters
+        defaults = {name: p.default for name, p in signature.items() if p.default is not inspect.Parameter.empty}
+        return self.declaration.needs_with({**defaults, **params})
 
     def load(self) -> Any:
         """Import the target."""

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from agentspec.llm.base import ContextOverflowError, Message, assistant, user
 from agentspec.llm.recorder import BudgetExceededError, ModuleLLM
-from agentspec.structured import ParseError, Parser, without_thinking
+from agentspec.structured import ParseError, Parser
 from agentspec.types import Credit, LLMCall, Sampled
+from agentspec.visible import visible
 
 if TYPE_CHECKING:
     from agentspec.context import Context
@@ -183,7 +184,7 @@ class Services:
             self.llm.credit(call, i, credit)
         cut = call.completions[0].finish_reason == "length"
         if parse is None:
-            text = without_thinking(call.text)
+            text = visible(call.text)[0]
             return Answer(text or None, call, "truncated" if cut else "" if text else "malformed")
         try:
             return Answer(parse(call.text), call)

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.world import help, moving, services, vehicles, work
 from agentspec.envs.deliverybench.world.clock import ShiftOver, end_episode, pass_time
-from agentspec.envs.deliverybench.world.grammar import Refused
+from agentspec.envs.deliverybench.world.grammar import Refused, understood
 from agentspec.envs.deliverybench.world.recorder import evaluate, report
 from agentspec.envs.deliverybench.world.settlement import Settlement
 from agentspec.envs.deliverybench.world.shift import Shift
@@ -132,7 +131,7 @@ class World(Shift):
     def _read(self, text: str) -> Action | ActionError:
         if self.rules.strict_reading and _ONE_LINE_FENCE.fullmatch(text.strip()):
             return ActionError("PARSE_NOT_CALL", "a code fence needs lines of its own; write the call alone", "")
-        return parse_action(text, self.schema)
+        return understood(text, self.schema)
 
     def _think(self, seconds: float) -> bool:
         """Count a call and let the seconds of deliberation pass; whether the shift goes on."""

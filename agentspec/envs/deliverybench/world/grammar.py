@@ -13,14 +13,16 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
+from agentspec.actions import parse_action
 from agentspec.envs.deliverybench.world.notes import METHODS
 from agentspec.envs.deliverybench.world.rules import Rules
-from agentspec.types import Action, ActionSchema, ActionSpec, Parameter
+from agentspec.types import Action, ActionError, ActionSchema, ActionSpec, Parameter
 
 MAX_COORDINATE = 1e7
 """Farthest coordinate (cm) a move may name: 100 km, far outside any city."""
 
 MAX_INTEGER = 10**12
+MAX_TEXT = 4000
 _MISSING = object()
 
 
@@ -205,6 +207,14 @@ def advertised(schema: ActionSchema) -> ActionSchema:
     """The schema without the actions that are of no use to the only courier of a city; they still work when called."""
     specs = {name: spec for name, spec in schema.actions.items() if name not in SOCIAL}
     return replace(schema, actions=specs)
+
+
+def understood(text: str, schema: ActionSchema) -> Action | ActionError:
+    """The action of a text; one of more than `MAX_TEXT` characters is none, and is not searched for any."""
+    if len(text) > MAX_TEXT:
+        problem = f"the answer has {len(text)} characters; write one action only"
+        return ActionError("PARSE_TOO_LONG", problem, text[:200])
+    return parse_action(text, schema)
 
 
 def argument(action: Action, position: int, *names: str) -> Any:

@@ -1,0 +1,84 @@
+"""One level of CAM's hierarchy: a graph whose nodes may belong to several clusters, kept up to date as it grows.
+
+Every node is split into replicas, one per group of its neighbours that hang together without it (ego-splitting); labels
+spread over the graph of replicas, and replicas of one label are a cluster. When nodes or edges change, only the nodes
+they touch are split anew, and labels spread from their replicas: a replica keeps the label of the one it comes from
+(the one of the same node with most neighbours in common), a new one gets a label that was never there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from agentspec.retrieval import Graph, ego_split, label_propagation, replica_graph
+
+
+def affinity(cosine: float, apart: float, alpha: float = 0.6, sigma: float = 1.0) -> float:
+    """How strongly two chunks belong together: likeness in meaning and nearness in order.
+
+    >>> round(affinity(0.5, 1), 4)
+    0.5426
+    """
+    return alpha * cosine + (1 - alpha) * math.exp(-(apart**2) / (2 * sigma**2))
+
+
+class Level:
+    """A graph of nodes, their replicas, and the label of each."""
+
+    def __init__(self) -> None:
+        self.graph: Graph[int] = Graph()
+        self.replicas: dict[int, list[list[int]]] = {}
+        self.labels: dict[tuple[int, int], int] = {}
+        self.fresh = 0  # the next label that was never there
+
+    def touch(self, nodes: Iterable[int]) -> None:
+        """Bring replicas and labels up to date after these nodes came, went, or got or lost edges."""
+        nodes = list(nodes)
+        around = [n for node in nodes if node in self.graph for n in (node, *self.graph.neighbours(node))]
+        affected = dict.fromkeys(around)
+        before = {
+            node: [(set(part), self.labels[node, i]) for i, part in enumerate(self.replicas[node])]
+            for node in affected
+            if node in self.replicas
+        }
+        split = ego_split(self.graph, affected)
+        self.replicas = {node: split.get(node) or self.replicas[node] for node in self.graph}
+        labels: dict[tuple[int, int], int] = {}
+        for node, parts in self.replicas.items():
+            if node not in affected:
+                labels |= {(node, i): self.labels[node, i] for i in range(len(parts))}
+                continue
+            for i, part in enumerate(parts):
+                labels[node, i] = self._inherited(set(part), before.get(node, []))
+        changed = [(node, i) for node in affected for i in range(len(self.replicas[node]))]
+        self.labels = label_propagation(replica_graph(self.graph, self.replicas), start=labels, changed=changed)
+
+    def _inherited(self, part: set[int], old: list[tuple[set[int], int]]) -> int:
+        """The label of the old replica with most neighbours in common (then taken), or a fresh one."""
+        best = max(old, key=lambda o: len(o[0] & part), default=None)
+        if best is not None and (best[0] & part or not best[0]):
+            old.remove(best)
+            return best[1]
+        self.fresh += 1
+        return self.fresh - 1
+
+    def clusters(self, least: int = 2) -> dict[int, list[int]]:
+        """Label -> its nodes, in order of insertion; those of at least `least` nodes."""
+        found: dict[int, dict[int, None]] = {}
+        for (node, _), label in self.labels.items():
+            found.setdefault(label, {})[node] = None
+        return {label: list(nodes) for label, nodes in found.items() if len(nodes) >= least}
+
+    def state(self) -> list[Any]:
+        """JSON-like state."""
+        replicas = [[node, parts] for node, parts in self.replicas.items()]
+        return [self.graph.state(), replicas, [[*replica, label] for replica, label in self.labels.items()], self.fresh]
+
+    def load(self, state: list[Any]) -> None:
+        """Return to `state`."""
+        graph, replicas, labels, self.fresh = state
+        self.graph.load(graph)
+        self.replicas = {node: parts for node, parts in replicas}
+        self.labels = {(node, i): label for node, i, label in labels}
