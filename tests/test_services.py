@@ -213,3 +213,12 @@ def test_time_and_ids_go_on_over_the_episodes_of_a_run() -> None:
     assert after.time == Time(1, 0, 5) and [after.new_id("memory.a"), after.new_id("memory.b")] == [2, 1]
     clock.new_id("memory.a")  # a fork does not see the other's
     assert after.new_id("memory.a") == 3
+
+
+@pytest.mark.parametrize(("scope", "carried"), [("episode", False), ("run", True)])
+def test_a_module_knows_whether_its_memory_is_carried_on(scope: str, carried: bool) -> None:
+    from agentspec.spec import AgentSpec
+
+    recorder = Recorder(ScriptedLLM([""]), episode="e", seed=0)
+    agent = AgentSpec.from_data({"memory": "base", "scope": scope}).build(recorder)
+    assert {s.carried for s in agent.services} == {carried}
