@@ -45,8 +45,8 @@ HEAD = "You manage the memory of an agent that acts in an environment.\n\nTask: 
 SEMANTIC = (
     "\n\nFacts on record that may be about the same:\n{facts}\n\nKeep the record of facts true: insert what is new and "
     "will matter later, patch (put a new text in place of the fact of that id) what has changed, delete what proved "
-    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits, none if nothing "
-    "is new. Answer with JSON:\n"
+    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits, none if "
+    "nothing is new. Answer with JSON:\n"
     '{{"edits": [{{"op": "insert" | "patch" | "delete", "id": number or null, "text": fact}}]}}'
 )
 EPISODIC = (
@@ -56,8 +56,8 @@ EPISODIC = (
 )
 PROCEDURAL = (
     "\n\nThe agent follows these instructions of its own:\n{instructions}\n\nImprove them in the light of the steps "
-    "and their rewards: keep what works, correct what failed, add what was missing. At most {words} words, short imperative "
-    "sentences with numbers. Write the new instructions and nothing else, or NO_CHANGE."
+    "and their rewards: keep what works, correct what failed, add what was missing. At most {words} words, short "
+    "imperative sentences with numbers. Write the new instructions and nothing else, or NO_CHANGE."
 )
 
 

@@ -166,6 +166,7 @@ class MemGPT:
         self._found: list[str] = []
         self._asked, self._queued, self._warned = 0, 0, False  # steps of this episode
         self._task = ""
+        self._old_task = False  # the block `task` was written in an earlier episode
         self._counts = {"evictions": 0, "function_errors": 0}
         self._build_indices()
 
@@ -180,11 +181,12 @@ class MemGPT:
     def begin_episode(self, task: Task) -> None:
         self._asked, self._queued, self._warned = 0, 0, False
         self._found, self.summary = [], ""
+        self._old_task = bool(self.blocks["task"])
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """Core blocks, what the last search found; where no conversation shows them, summary and queue."""
         items = [
-            RecallItem(f"[{name}] {text}", kind="core", source=name, priority=4.0)
+            RecallItem(f"[{self._label(name)}] {text}", kind="core", source=name, priority=4.0)
             for name, text in self.blocks.items()
             if text
         ]
@@ -238,7 +240,9 @@ class MemGPT:
         return EDIT.format(
             chars=self.block_chars,
             task=self._task,
-            blocks="\n".join(f"{n} ({len(t)} of {self.block_chars}): {t or '(empty)'}" for n, t in self.blocks.items()),
+            blocks="\n".join(
+                f"{self._label(n)} ({len(t)} of {self.block_chars}): {t or '(empty)'}" for n, t in self.blocks.items()
+            ),
             archived=len(self.archive),
             recorded=len(self.recall),
             steps="\n".join(newest_within(steps, self.steps_tokens, count)),
@@ -265,6 +269,8 @@ class MemGPT:
 
     def _core_append(self, call: FunctionCall) -> str:
         before = self.blocks.get(call.block, "")
+        if call.text.strip() and call.text.strip() in before:
+            return "it says so already"
         return self._set_block(call.block, "\n".join(filter(None, (before, call.text.strip()))))
 
     def _core_replace(self, call: FunctionCall) -> str:
@@ -280,12 +286,15 @@ class MemGPT:
             full = f"Error: block {block} would hold {len(text)} of {self.block_chars} characters"
             return f"{full}; shorten it with core_replace, or use archive_insert"
         self.blocks[block] = text
+        self._old_task = self._old_task and block != "task"
         return "done"
 
     def _archive_insert(self, call: FunctionCall) -> str:
         text = clip_text(" ".join(call.text.split()), self.answer_tokens, self.services.llm.count_tokens)
         if not text:
             return "Error: archive_insert needs a text"
+        if text in self.archive.values():
+            return "it is there already"
         key = self.services.new_id()
         self.archive[key] = text
         if self._vectors is not None:
@@ -370,6 +379,9 @@ class MemGPT:
         count = self.services.llm.count_tokens
         return context.tokens() - sum(count(m.text) for m in context.older(keep))
 
+    def _label(self, block: str) -> str:
+        return "task, as of an earlier episode" if block == "task" and self._old_task else block
+
     def _named(self, message: Message) -> str:
         return f"{step_name(message.episode, message.step, self.services.time())}: {message.text}"
 
@@ -387,14 +399,14 @@ class MemGPT:
 
     def snapshot(self) -> bytes:
         recorded = [[key, list(asdict(m).values())] for key, m in self.recall.items()]
-        here = [self._asked, self._queued, self._warned, self._task, self._found]
+        here = [self._asked, self._queued, self._warned, self._task, self._found, self._old_task]
         return dump_state([self.blocks, self.summary, recorded, list(self.archive.items()), here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         self.blocks, self.summary, recorded, archive, here, self._counts = load_state(blob)
         self.recall = {key: Message(*values) for key, values in recorded}
         self.archive = {key: text for key, text in archive}
-        self._asked, self._queued, self._warned, self._task, self._found = here
+        self._asked, self._queued, self._warned, self._task, self._found, self._old_task = here
         self._build_indices()
 
     def _build_indices(self) -> None:

@@ -251,7 +251,7 @@ class Mirix:
         fields = ", ".join(f'"{name}": text' for name in STORES[store][1])
         prompt = head + self._related(related) + EDIT.format(store=store, fields=fields)
         answer = await self.services.ask("edit", prompt, self.answer_tokens, json_of(Edit))
-        return answer.value  # type: ignore[no-any-return]
+        return answer.value
 
     def _related(self, keys: Sequence[int]) -> str:
         lines = [f"{key} [{self.entries[key].store}] {self.entries[key].text}" for key in keys]
@@ -269,12 +269,16 @@ class Mirix:
         fields = {name: text for name, text in fields.items() if text}
         before = self.entries.get(-1 if edit.id is None else edit.id)
         addressed = before is not None and before.store == store
-        if not fields or (edit.op != "insert" and store != "core" and not addressed):
+        known_already = edit.op == "insert" and any(
+            e.store == store and e.fields == fields for e in self.entries.values()
+        )
+        if not fields or known_already or (edit.op != "insert" and store != "core" and not addressed):
             self._counts["refused_edits"] += 1
             return
         self._counts["edits"] += 1
         if store == "core":
-            text = fields["text"] if edit.op == "update" else f"{self.core}\n{fields['text']}".strip()
+            new = "" if fields["text"] in self.core else fields["text"]
+            text = fields["text"] if edit.op == "update" else f"{self.core}\n{new}".strip()
             self.core = text[: self.core_chars]
         elif edit.op == "insert" or before is None or edit.id is None:
             self._put(self.services.new_id(), Entry(store, fields, now.episode, now.step))

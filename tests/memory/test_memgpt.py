@@ -9,7 +9,7 @@ import pytest
 from agentspec.context import Context
 from agentspec.memory.memgpt import CARRY, MemGPT
 from agentspec.registry import SpecError
-from tests.memory.by_hand import Asked, learn, recall, services, step
+from tests.memory.by_hand import TASK, Asked, learn, recall, services, step
 from tests.memory.recall_world import succeeds
 
 
@@ -156,17 +156,33 @@ def test_a_bad_answer_changes_nothing_and_is_counted(answer: str) -> None:
 
 
 def test_snapshots_are_exact_and_stores_are_bounded() -> None:
-    insert = {"function": "archive_insert", "text": "fact"}
+    insert = {"function": "archive_insert", "text": "fact 0"}
     search = {"function": "archive_search", "query": "fact"}
     asked = Asked(edit=calls(append("a"), insert, search), summary="S.")
     memory = gpt(asked, max_recall=4, max_archive=2, queue_tokens=60)
     learn(memory, *(step(i, f"room {i}") for i in range(7)))
-    assert len(memory.recall) == 4 and len(memory.archive) == 2
+    assert len(memory.recall) == 4 and list(memory.archive.values()) == ["fact 0"], "what is there is not put twice"
+    assert memory.blocks["task"] == "a"
+    for fact in ("fact 1", "fact 2"):
+        memory._archive_insert(inserted(fact))
+    assert list(memory.archive.values()) == ["fact 1", "fact 2"]
     other = gpt(max_recall=4, max_archive=2, queue_tokens=60)
     other.services.clock.step = memory.services.clock.step
     other.restore(memory.snapshot())
     assert other.snapshot() == memory.snapshot() and recall(other, "x") == recall(memory, "x")
     assert "Core memory\n[task] a" in memory.describe()
+
+
+def test_a_task_of_an_earlier_episode_is_marked_until_it_is_written_anew() -> None:
+    memory = gpt(
+        Asked(edit=[calls(append("Order 3."), append("Charge.", "strategy")), NONE, calls(append("Order 4."))])
+    )
+    learn(memory, step(0, "a"))
+    memory.begin_episode(TASK)
+    learn(memory, step(0, "b"))
+    assert recall(memory, "b")[:2] == ["[task, as of an earlier episode] Order 3.", "[strategy] Charge."]
+    learn(memory, step(1, "c"))
+    assert recall(memory, "c")[0] == "[task] Order 3.\nOrder 4."
 
 
 def test_bad_parameters_are_refused() -> None:

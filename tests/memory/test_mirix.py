@@ -49,6 +49,7 @@ def test_merge_and_update_keep_the_id() -> None:
         ("vault", Edit("update", 0, {"value": "x"})),  # 0 is an entry of another store
         ("semantic", Edit("insert", fields={"colour": "red"})),
         ("semantic", Edit("insert", fields={"name": " "})),
+        ("semantic", Edit("insert", fields={"name": "mill"})),
         ("attic", Edit("insert", fields={"name": "x"})),
     ],
 )
