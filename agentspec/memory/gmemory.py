@@ -297,7 +297,7 @@ class GMemory:
         self._count += 1
 
     def _succeeded(self, trajectory: Trajectory, total: float) -> bool:
-        """What the environment says, or the threshold; else whether the return is above the mean so far (0 at first)."""
+        """What the environment says, or the threshold; else whether the return is above the mean so far."""
         said = trajectory.metrics.get("success")
         if said is not None:
             return bool(said)
