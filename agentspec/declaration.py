@@ -64,7 +64,7 @@ class Declaration:
         purposes: what its calls are for: the part of a call's path after `/`, which `train` patterns match.
         needs: backend capabilities (`score`, `n`, ...), `snapshots` of the environment, or an `embedder`.
         waived: need -> (parameter, value): with that value the method does without the need.
-        envs: registered environments the method is written for; empty: any.
+        scripted: whether it plays what the author of the environment scripted, where there is such a player.
         small: for the contract tests, sets of parameters under which, together, everything the method does fires
             within a dozen steps.
         small_calls: the call profile under each of `small`; `None`: as `calls`.
@@ -79,7 +79,7 @@ class Declaration:
     purposes: Mapping[str, Purpose] = field(default_factory=dict)
     needs: tuple[str, ...] = ()
     waived: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
-    envs: tuple[str, ...] = ()
+    scripted: bool = False
     small: tuple[Mapping[str, Any], ...] = ()
     small_calls: CallProfile | None = None
     scope: str = ""

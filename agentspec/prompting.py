@@ -22,10 +22,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from agentspec.llm.base import Message, assistant, user
-from agentspec.reading import Reading, read, visible
+from agentspec.reading import Reading, read
 from agentspec.registry import SpecError
 from agentspec.services import Services
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, RecallItem, Sampled
+from agentspec.visible import visible
 
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
 CALL_ANSWER = "Answer with exactly one action call and nothing else."
@@ -59,7 +60,7 @@ def render_actions(schema: ActionSchema) -> str:
 def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "") -> str:
     """Lessons and memory within the spec's budgets, a method's own transcript of the steps, then the observation.
 
-    Steps that the transcript tells are not told again by a memory that is nothing but a list of the newest steps.
+    Steps that the transcript tells are not told again by a memory: `base`, or items of kind `step`.
     """
     if transcript:
         recall = Recall(tuple(item for item in recall.items if not _a_step(item)))
@@ -68,7 +69,7 @@ def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcri
 
 
 def _a_step(item: RecallItem) -> bool:
-    return item.kind == "episodic" and item.source == "memory.base"
+    return item.kind == "step" or (item.kind == "episodic" and item.source == "memory.base")
 
 
 def default_answer(schema: ActionSchema) -> str:

@@ -129,6 +129,13 @@ class Reflection(Stateful, Protocol):
 
 
 @runtime_checkable
+class Described(Protocol):
+    """A memory (or reflector) that says in text what its state holds, for `agentspec view --memory`."""
+
+    def describe(self) -> str: ...
+
+
+@runtime_checkable
 class Measured(Protocol):
     """A module that has figures of its own to add to the trajectory's metrics (JSON-like)."""
 

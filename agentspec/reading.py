@@ -2,12 +2,11 @@
 
 In this order:
 
-1. Reasoning blocks (`<think>`, `[THINK]`, harmony channels, ...), closed or cut off, are removed; nothing in them
-counts.
-2. An action given as data (JSON, a tool call) counts where it comes before any `Action:` line.
-3. The *first* `Action:` line counts, in any case and dress, its call on the same or a later line. Whatever follows it,
-an
-   invented observation or a second turn, is dropped.
+1. Reasoning blocks (`<think>`, `[THINK]`, harmony channels, ...), closed or cut off, are removed
+   (`agentspec.visible`); nothing in them counts.
+2. An action given as data (JSON, a tool call; `agentspec.shapes`) counts where it comes before any `Action:` line.
+3. The *first* `Action:` line counts, in any case and dress, its call on the same or a later line (`agentspec.values`).
+   Whatever follows it, an invented observation or a second turn, is dropped.
 4. Without a label: a line that is a call (or a menu entry), numbered, quoted or with a remark after it.
 5. A single call in a sentence, where it is marked as code or closes the answer, and is not negated.
 
@@ -22,22 +21,10 @@ import re
 from dataclasses import dataclass
 
 from agentspec import literals, shapes
-from agentspec.literals import Call, known_name, parse_call, scan_call
+from agentspec.literals import known_name, scan_call
 from agentspec.types import Action, ActionError, ActionSchema
-
-MOST_CALLS = 64
-"""Opening brackets that are followed in one answer."""
-
-_BLOCKS = "think|thinking|thoughts?|reasoning|reason|reflection|analysis|scratchpad|inner_monologue"
-_BLOCK = re.compile(rf"<(/?)(?:{_BLOCKS})\b[^<>]*>|\[(/?)THINK\]|◁(/?)think▷", re.IGNORECASE)
-_FINAL = re.compile(r"<\|channel\|>\s*final\s*<\|message\|>")
-_TOOL = re.compile(r"<\|channel\|>\s*commentary\s+(?=to=)")
-_TOKEN = re.compile(r"<\|[^<>|]{1,40}\|>|</s>|<end_of_turn>|<eos>")
-_AS_LABEL = re.compile(r"<(action|answer|final_answer|command)>(.*?)(?:</\1>|$)", re.IGNORECASE | re.DOTALL)
-_BOXED = re.compile(r"\\boxed\{([^{}]*)\}")
-_SIGNS = str.maketrans(
-    {"“": '"', "”": '"', "‘": "'", "’": "'", "（": "(", "）": ")", "：": ":", "−": "-", "\u00a0": " ", "\u200b": ""}
-)
+from agentspec.values import CALL, DRESS, MOST_CALLS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, squeeze
+from agentspec.visible import undressed, visible
 
 _LABEL = re.compile(
     r"^[ \t>#*_\-•\"'`{]*(?:\(?\d+[.):][ \t]*)?[\"'*_` \t]*"
@@ -48,23 +35,12 @@ _LABEL = re.compile(
 )
 _HEADING = re.compile(r"^[ \t]*#+[ \t]*(?:final |next )?action[ \t:]*$", re.IGNORECASE | re.MULTILINE)
 _MID_LABEL = re.compile(r"\b(?:final |next )?action[ \t*_`]*:", re.IGNORECASE)
-_INPUT = re.compile(r"^[ \t*_`]*(?:action[ \t_]*input|arguments|args|parameters|input)[ \t*_`]*:[ \t*_`]*", re.I | re.M)
 _TURN = re.compile(
     r"^\W{0,4}(?:observation|user|human|environment|system|result)[ \t]*\d*[ \t*_]*:", re.I | re.MULTILINE
 )
 _THOUGHT = re.compile(r"^[ \t>#*_\-]*(?:thoughts?|reasoning|plan|analysis|rationale)[ \t]*\d*[ \t*_]*:", re.IGNORECASE)
 _FENCE = re.compile(r"^[ \t]*(?:```|~~~)[\w+\-]*[ \t]*", re.MULTILINE)
-_DRESS = re.compile(r"^(?:(?:```|~~~)[\w+\-]*\s|[\s>#*_`~\"'•\-]|\(?\d{1,2}[.):](?=\s))+")
 _BULLET = re.compile(r"^[ \t>]*(?:[*•\-]|\(?\d{1,2}[.):])[ \t]+")
-_CALL = re.compile(r"([A-Za-z_][\w.]*)[ \t]*\(")
-_SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]*\(")
-_SQUARE = re.compile(r"([A-Za-z_][\w.\-]*)[ \t]*\[")
-_WORD = re.compile(r"[A-Za-z_][\w\-]*")
-_REMARK = re.compile(
-    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|"
-    r"(?:because|since|as|to|so|in order|and|then|or|if|for)\b)",
-    re.IGNORECASE,
-)
 _NEGATED = re.compile(
     r"(?:\bnot|n't|\bnever|\bavoid(?:ing)?|\binstead of|\brather than|\bwithout|\bcannot)\W+(?:\w+\W+)?$", re.I
 )
@@ -82,54 +58,16 @@ class Reading:
     explicit: bool = False
 
 
-def visible(text: str) -> tuple[str, bool]:
-    """`text` without reasoning blocks, and whether one of them was never closed."""
-    if "<|channel|>" in text:
-        parts = _FINAL.split(text)
-        tool = _TOOL.search(text)
-        if len(parts) == 1 and tool is None:
-            return "", True
-        text = parts[-1] if len(parts) > 1 else text[tool.end() :] if tool else ""
-    kept: list[str] = []
-    depth = at = 0
-    for match in _BLOCK.finditer(text):
-        closes = "/" in (match.group(1) or "", match.group(2) or "", match.group(3) or "")
-        if not closes:
-            if not depth:
-                kept.append(text[at : match.start()])
-            depth += 1
-        elif depth:
-            depth -= 1
-        else:
-            kept = []  # opened by the chat template: all before it was reasoning
-        at = match.end()
-    if not depth:
-        kept.append(text[at:])
-    return _TOKEN.sub("", "".join(kept)).strip(), depth > 0
-
-
 def labelled(line: str) -> bool:
     """Whether a line says `Action:` and what."""
     label = _LABEL.match(line)
     return label is not None and bool(line[label.end() :].strip(" `*"))
 
 
-def takes_lines(text: str) -> bool:
-    """Whether one action is spread over several lines: a tool call in tags, or arguments on a line of their own."""
-    return "<function=" in text or "<invoke " in text or _INPUT.search(text) is not None
-
-
-def _plain(text: str) -> str:
-    """Signs and marks of prose made plain: curly quotes, escaped underscores, tags and boxes around an answer."""
-    text = text.translate(_SIGNS).replace("\\_", "_")
-    text = _AS_LABEL.sub(lambda m: f"\nAction: {m.group(2).strip()}\n", text)
-    return _BOXED.sub(lambda m: f"\nAction: {m.group(1)}\n", text).strip()
-
-
 def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     """Read an answer; `cut` says that it ended because its room was used up."""
     shown, open_block = visible(text)
-    plain = _plain(shown)
+    plain = undressed(shown)
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
     if isinstance(reading.action, Action):
         return reading
@@ -145,7 +83,7 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
 def _inert(text: str, schema: ActionSchema) -> str:
     """The beginning of `text`, unless that would read as an action."""
     text = text[:200]
-    plain = _plain(visible(text)[0])
+    plain = undressed(visible(text)[0])
     return "" if plain and isinstance(_Reader(plain, schema).read().action, Action) else text
 
 
@@ -172,26 +110,25 @@ class _Reader:
         turn = next((m.start() for m in _TURN.finditer(text) if _after_thought(text[: m.start()])), len(text))
         self.text = text[:turn]
         self.schema = schema
-        self.choices = {_squeeze(c): c for c in schema.choices}
-        self.scans = 0
+        self.values = Values(schema)
 
     def read(self) -> Reading:
-        choice = self.choices.get(_squeeze(self.text))
+        choice = self.values.choices.get(squeeze(self.text))
         if choice is not None:
             return Reading(Action(choice, text=choice), explicit=True)
         label = _HEADING.search(self.text) or _LABEL.search(self.text)
         shape = shapes.find_shape(self.text, self.schema)
         if shape is not None and (label is None or shape.start <= label.end()):
             thought = shape.thought or _thought(self.text[: min(shape.start, label.start() if label else shape.start)])
-            return Reading(self._value(shape.text) or self._nothing(shape.text), thought, explicit=True)
+            return Reading(self.values.read(shape.text) or self._nothing(shape.text), thought, explicit=True)
         if label is not None:
             thought = _thought(self.text[: label.start()])
             value = self.text[label.end() :]
-            return Reading(self._value(value) or self._nothing(_first_line(value)), thought, explicit=True)
+            return Reading(self.values.read(value) or self._nothing(first_line(value)), thought, explicit=True)
         found = self._line()
         if found is None:
             inline = _MID_LABEL.search(self.text)
-            meant = self._value(self.text[inline.end() :]) if inline else None
+            meant = self.values.read(self.text[inline.end() :]) if inline else None
             found = (meant, inline.start()) if inline and meant else None
         action, at = found or (self._mention(), len(self.text))
         if action is None:
@@ -200,84 +137,6 @@ class _Reader:
 
     def _nothing(self, text: str) -> ActionError:
         return _no_action(text.strip(), self.schema)
-
-    def _value(self, text: str) -> Action | ActionError | None:
-        """The action at the beginning of what follows a label."""
-        text = _DRESS.sub("", text, count=1) if text.lstrip()[:1] not in ("{", "[") else text.lstrip()
-        choice = self._choice_at(text)
-        if choice is not None:
-            return choice
-        if text[:1] in ("{", "[", "<"):
-            shape = shapes.find_shape(text, self.schema)
-            if shape is not None and not text[: shape.start].strip("[< \n\t"):
-                return self._value(shape.text)
-        for pattern in (_CALL, _SPACED_CALL):
-            match = pattern.match(text)
-            if match is not None and (pattern is _CALL or known_name(match.group(1), self.schema)):
-                return self._call(text, match)
-        square = _SQUARE.match(text)
-        if square is not None and known_name(square.group(1), self.schema):
-            return self._square(text, square)
-        return self._bare(text)
-
-    def _call(self, text: str, match: re.Match[str]) -> Action | ActionError | None:
-        self.scans += 1
-        call = scan_call(text, match) if self.scans <= MOST_CALLS else None
-        if call is None:
-            return None
-        if text[call.end : call.end + 1] in ("(", "["):
-            name = known_name(call.name, self.schema) or call.name
-            return ActionError("PARSE_ARGS", f"{name} has more than one list of arguments; write one call", call.text)
-        return parse_call(call, self.schema)
-
-    def _square(self, text: str, match: re.Match[str]) -> Action | ActionError | None:
-        """`NAME[args]`, as in ReAct's own prompts; one list for an action that takes one parameter."""
-        call = scan_call(text, match)
-        if call is None:
-            return None
-        name = known_name(call.name, self.schema) or call.name
-        inner = call.arguments
-        if "," in inner and len(self.schema.actions[name].parameters) == 1:
-            inner = f"[{inner}]"
-        return parse_call(Call(name, inner, f"{name}({inner})", call.end), self.schema)
-
-    def _bare(self, text: str) -> Action | ActionError | None:
-        """A name without brackets, its arguments perhaps on a line of their own."""
-        match = _WORD.match(text)
-        name = known_name(match.group(), self.schema) if match else None
-        if match is None or name is None:
-            return None
-        given = _INPUT.search(text, match.end())
-        if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
-            value = (
-                _DRESS.sub("", text[given.end() :], count=1)
-                if text[given.end() :][:1] not in "{["
-                else text[given.end() :]
-            )
-            data = shapes.find_shape(f'{{"action": "{name}", "args": ' + value.rstrip("`\n ") + "}", self.schema)
-            line = _first_line(value).strip("`\"'* ")
-            inner = data.text if data is not None else f"{name}({line})"
-            return self._value(inner)
-        if not _REMARK.match(text, match.end()):
-            return None
-        spec = self.schema.actions[name]
-        missing = [p for p, parameter in spec.parameters.items() if parameter.required]
-        if missing:
-            problem = f"{name} needs {', '.join(missing)}; write {spec.example or name}"
-            return ActionError("PARSE_ARGS", problem, name)
-        return Action(name, text=f"{name}()")
-
-    def _choice_at(self, text: str) -> Action | None:
-        """The longest menu entry that `text` begins with, a remark at most after it."""
-        line = _first_line(text)
-        squeezed = _squeeze(line)
-        if squeezed in self.choices:
-            return Action(self.choices[squeezed], text=self.choices[squeezed])
-        folded = line.casefold()
-        for choice in sorted(self.schema.choices, key=len, reverse=True):
-            if folded.startswith(choice.casefold()) and _REMARK.match(line, len(choice)):
-                return Action(choice, text=choice)
-        return None
 
     def _line(self) -> tuple[Action | ActionError, int] | None:
         """The first line that is an action, and where it begins; an error where a list leaves open which is meant."""
@@ -292,7 +151,7 @@ class _Reader:
                 found.append((action, start, bool(_BULLET.match(line))))
                 prose_after = False
             else:
-                prose_after = prose_after or bool(_DRESS.sub("", line).strip())
+                prose_after = prose_after or bool(DRESS.sub("", line).strip())
             if found and not found[0][2]:
                 break  # not a list: the first counts
         actions = {a.text for a, _, _ in found if isinstance(a, Action)}
@@ -303,31 +162,31 @@ class _Reader:
 
     def _action_line(self, text: str, line: str) -> Action | ActionError | None:
         """The action that `text` begins with if its first line, `line`, is nothing but an action and a remark."""
-        dressed = _DRESS.match(text)
+        dressed = DRESS.match(text)
         bare = text[dressed.end() :] if dressed and dressed.end() < len(line) else text
-        choice = self._choice_at(bare)
+        choice = self.values.choice(bare)
         if choice is not None:
             return choice
-        match = _CALL.match(bare) or _SPACED_CALL.match(bare)
+        match = CALL.match(bare) or SPACED_CALL.match(bare)
         if match is not None:
-            action = self._call(bare, match)
+            action = self.values.call(bare, match)
             whole = scan_call(bare, match)
             known = known_name(match.group(1), self.schema) is not None
-            if action is None or whole is None or not _REMARK.match(bare, whole.end):
+            if action is None or whole is None or not REMARK.match(bare, whole.end):
                 # `MOVE(1)(2)` is an action gone wrong, "I think (perhaps) so" is none.
                 return action if known and isinstance(action, ActionError) else None
-            alone = _CALL.match(bare) is not None and not bare[whole.end :].strip(" \t\n`*.;\"'")
+            alone = CALL.match(bare) is not None and not bare[whole.end :].strip(" \t\n`*.;\"'")
             return action if known or alone else None
-        word = _WORD.match(bare)
+        word = WORD.match(bare)
         if (
             word is not None
             and known_name(word.group(), self.schema)
-            and not _first_line(bare[word.end() :]).strip(" `*.;\"'")
+            and not first_line(bare[word.end() :]).strip(" `*.;\"'")
         ):
-            return self._bare(bare) if word.group().isupper() or "_" in word.group() else None
-        square = _SQUARE.match(bare)
+            return self.values.bare(bare) if word.group().isupper() or "_" in word.group() else None
+        square = SQUARE.match(bare)
         known = square is not None and known_name(square.group(1), self.schema) is not None
-        return self._square(bare, square) if known and square is not None else None
+        return self.values.square(bare, square) if known and square is not None else None
 
     def _mention(self) -> Action | None:
         """A single action in prose, marked as code or closing the answer, not negated and not merely thought of."""
@@ -335,9 +194,9 @@ class _Reader:
         text = self.text[: turn.start()] if turn and turn.start() else self.text
         text = "".join("" if _THOUGHT.match(line) else line for line in text.splitlines(keepends=True))
         found: list[tuple[Action, int, int]] = []
-        for match in _CALL.finditer(text):
-            if known_name(match.group(1), self.schema) and self.scans < MOST_CALLS:
-                action = self._call(text, match)
+        for match in CALL.finditer(text):
+            if known_name(match.group(1), self.schema) and self.values.scans < MOST_CALLS:
+                action = self.values.call(text, match)
                 whole = scan_call(text, match)
                 if isinstance(action, Action) and whole is not None:
                     found.append((action, match.start(), whole.end))
@@ -358,15 +217,6 @@ class _Reader:
                 if not any(s < match.end() and match.start() < e for _, s, e in found):
                     found.append((Action(choice, text=choice), match.start(), match.end()))
         return sorted(found, key=lambda f: f[1])
-
-
-def _squeeze(text: str) -> str:
-    """`text` for comparison with a menu entry: without dress, case, and closing signs."""
-    return " ".join(_DRESS.sub("", text).split()).strip(" \t`*_\"'.,;:!?").casefold()
-
-
-def _first_line(text: str) -> str:
-    return next((line for line in text.splitlines() if line.strip()), "")
 
 
 def _after_thought(text: str) -> bool:

@@ -2,8 +2,8 @@
 
 A name is one of:
 
-- a method of this package: `agentspec/<kind>/<name>.py` holds its class, and the class its declaration (see
-  :mod:`agentspec.declaration`); nothing else is imported to find it;
+- a method of this package: `agentspec/<kind>/<name>.py` (or a folder `<name>` with an `__init__.py`) holds its class,
+  and the class its declaration (see `agentspec.declaration`); nothing else is imported to find it;
 - `package.module:Class`, anybody's;
 - a name of a module that was brought in: by `import_modules` (`--import` on the command line, `imports` in a spec or
   configuration) or by an installed distribution with an entry point in the group `agentspec.modules` (`name =
@@ -79,9 +79,9 @@ class Entry:
         return self.declaration.waived
 
     @property
-    def envs(self) -> tuple[str, ...]:
-        """Environments it is written for; empty: any."""
-        return self.declaration.envs
+    def scripted(self) -> bool:
+        """Whether it plays what an environment's author scripted."""
+        return self.declaration.scripted
 
     @property
     def presets(self) -> dict[str, CallProfile]:
@@ -209,14 +209,14 @@ class Registry:
             importlib.import_module(f"{self._package}.envs")  # registers its own when imported
             return []
         package = importlib.import_module(f"{self._package}.{kind}")
-        return [m.name for m in pkgutil.iter_modules(package.__path__) if not m.ispkg]
+        return [m.name for m in pkgutil.iter_modules(package.__path__)]
 
     def _from_file(self, kind: str, name: str) -> None:
-        """Register what `agentspec/<kind>/<name>.py` declares: the class without a name of its own gets the file's."""
+        """Register what a file (or the `__init__` of a folder) declares: a class without a name gets the file's."""
         module = importlib.import_module(f"{self._package}.{kind}.{name}")
         for cls in _declared(module):
             called = cls.declaration.name or name
-            self.register(kind_of(cls), called, Entry(f"{module.__name__}:{cls.__name__}", cls.declaration))
+            self.register(kind_of(cls), called, Entry(f"{cls.__module__}:{cls.__name__}", cls.declaration))
 
     def _from_entry_point(self, point: metadata.EntryPoint) -> None:
         """Register what an entry point names: a class under the point's name, a module's classes under theirs.
@@ -282,10 +282,12 @@ def snake_case(name: str) -> str:
 
 
 def _declared(module: ModuleType) -> Iterator[Any]:
-    """The classes that `module` itself defines and that have a declaration of their own."""
+    """The classes with a declaration of their own that `module` defines, itself or, where it is a folder, in a part."""
     for value in list(vars(module).values()):
-        if inspect.isclass(value) and value.__module__ == module.__name__ and "declaration" in vars(value):
-            yield value
+        if inspect.isclass(value) and "declaration" in vars(value):
+            own = value.__module__ == module.__name__
+            if own or (hasattr(module, "__path__") and value.__module__.startswith(f"{module.__name__}.")):
+                yield value
 
 
 def _from_path(kind: str, name: str) -> Entry:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from agentspec.llm.base import ContextOverflowError, Message, assistant, user
 from agentspec.llm.recorder import BudgetExceededError, ModuleLLM
-from agentspec.structured import ParseError, Parser, without_thinking
+from agentspec.structured import ParseError, Parser
 from agentspec.types import Credit, LLMCall, Sampled
+from agentspec.visible import visible
 
 if TYPE_CHECKING:
     from agentspec.context import Context
@@ -108,6 +109,8 @@ class Services:
         embedder: text embeddings, or `None` where the spec names no embedder.
         new_id: ids of the module, never the same twice in a run.
         simulator: the environment for search, or `None` where it has no snapshots.
+        carried: whether a later episode starts from this one's memory (`scope: run`); otherwise what is written after
+            the last step serves nobody.
     """
 
     llm: ModuleLLM
@@ -117,6 +120,7 @@ class Services:
     embedder: Embedder | None = None
     new_id: Callable[[], int] = field(default_factory=lambda: itertools.count().__next__)
     simulator: Simulator | None = None
+    carried: bool = True
 
     def time(self) -> Time:
         """Episode, step, and steps of the run so far."""
@@ -180,7 +184,7 @@ class Services:
             self.llm.credit(call, i, credit)
         cut = call.completions[0].finish_reason == "length"
         if parse is None:
-            text = without_thinking(call.text)
+            text = visible(call.text)[0]
             return Answer(text or None, call, "truncated" if cut else "" if text else "malformed")
         try:
             return Answer(parse(call.text), call)

@@ -274,7 +274,9 @@ class AgentSpec:
                 path = names[kind] = f"{kind}.{spec.short}"
                 rng = random.Random(derive_seed(recorder.seed, path))
                 new_id = functools.partial(clock.new_id, path)
-                provided.append(Services(ModuleLLM(recorder, path), context, clock, rng, embedder, new_id))
+                module_llm = ModuleLLM(recorder, path)
+                carried = self.scope == "run"
+                provided.append(Services(module_llm, context, clock, rng, embedder, new_id, carried=carried))
                 arguments = (provided[-1],)
             try:
                 modules[kind] = cls(*arguments, **spec.params)

@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from agentspec.visible import visible
+
 T = TypeVar("T")
 
-_THINKING = re.compile(r"<(think|thinking|reasoning)>.*?(?:</\1>|\Z)", re.DOTALL | re.IGNORECASE)
-_THINKING_ENDS = re.compile(r"\A.*</(think|thinking|reasoning)>", re.DOTALL | re.IGNORECASE)
 _STARTS = re.compile(r"[\[{]")
 _MOST_STARTS = 64  # values tried in one text; a longer search only serves texts that are no answer
 HUGE = 1e300
@@ -65,7 +65,7 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
 
     def read(text: str) -> Any:
         problem = "there is no JSON in it"
-        for raw in _values(without_thinking(text)):
+        for raw in _values(visible(text)[0]):
             try:
                 return check(_replace_surrogates(raw) if "\\u" in text else raw, schema)
             except ParseError as error:
@@ -76,15 +76,6 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
         raise ParseError(problem)
 
     return Parser(read, f"JSON of the form {describe(schema)}", repairs)
-
-
-def without_thinking(text: str) -> str:
-    """The text without its reasoning blocks: closed, cut off, or opened by the prompt.
-
-    >>> without_thinking("hm</think>Yes. <think>or")
-    'Yes.'
-    """
-    return _THINKING_ENDS.sub("", _THINKING.sub("", text)).strip()
 
 
 def _values(text: str) -> Iterator[Any]:

@@ -19,8 +19,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.deliverybench import City, generate, load_city
-from agentspec.envs.deliverybench.city.generate import SPLITS
+from agentspec.envs.deliverybench.city.citymap import City, load_city
+from agentspec.envs.deliverybench.city.generate import SPLITS, generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
 from agentspec.envs.deliverybench.world.orders import OrderBook

@@ -29,9 +29,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.deliverybench import City, load_city, write_city
 from agentspec.envs.deliverybench.city.cache import CACHE_VARIABLE
-from agentspec.envs.deliverybench.city.citymap import forget_cities
+from agentspec.envs.deliverybench.city.citymap import City, forget_cities, load_city
+from agentspec.envs.deliverybench.city.generate import write_city
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe

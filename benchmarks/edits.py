@@ -241,10 +241,28 @@ def with_spaces(folder: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b'":', b'": ', 1))
 
 
+def with_a_file_of_another_name(folder: Path) -> None:
+    """Episodes beside those of the rounds: whoever reads all of the folder would read them too."""
+    (folder / First).with_name("more.jsonl").write_bytes((folder / First).read_bytes())
+
+
+def with_bytes(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+    """A line that no reader looks at: `new` instead of the last `old`."""
+
+    def change(folder: Path) -> None:
+        before, _, after = (folder / name).read_bytes().rpartition(old)
+        (folder / name).write_bytes(before + new + after)
+
+    return change
+
+
 FILE_KINDS: dict[str, Callable[[Path], None]] = {
     "a trajectory file deleted": without_first_round,
     "a trajectory file added": with_a_round_more,
     "bytes that read the same": with_spaces,
+    "a trajectory file of another name added": with_a_file_of_another_name,
+    **{f"a torn line in {name}": with_bytes(name, b"\n", b'\n{"step": 9') for name in (UPDATES, METRICS, EVALUATIONS)},
+    **{f"a blank line in {name}": with_bytes(name, b"\n{", b"\n\n{") for name in (UPDATES, METRICS, EVALUATIONS)},
 }
 """Kind -> what is done to a run's folder."""
 

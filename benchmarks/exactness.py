@@ -300,8 +300,9 @@ def trainer_gradients(model: Any, batch: Sequence[Rollout], config: dict[str, An
         episodes = [trajectory(r, i) for i, r in enumerate(batch)]
         return [ScoredEpisode(t, rewards.score(t)) for t in episodes]
 
-    # A loss that looks at micro-batches one by one is defined by one of them; the others are split in three.
-    parts = 1 if config["loss_type"] in ("grpo", "bnpo") else 3
+    # A loss that looks at micro-batches one by one is defined by one of them; the others are split in as many as need
+    # padding.
+    parts = 1 if config["loss_type"] == "bnpo" else 3
     with tempfile.TemporaryDirectory() as folder, patch("trainers.grpo.collect", play):
         settings = ScaffoldConfig(
             output_dir=folder,

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from agentspec.envs.deliverybench import load_city
+from agentspec.envs.deliverybench.city.citymap import load_city
 from agentspec.envs.deliverybench.world.orders import Offer, OrderBook
 from agentspec.envs.deliverybench.world.rules import ORIGINAL
 

@@ -216,7 +216,7 @@ def _rss_mb() -> float:
 
 def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) -> dict[str, float]:
     """Both sides in turn on one layout."""
-    from trainers.tree import build_tree
+    from trainers.tree.trie import build_tree
 
     vocabulary = int(ours.model.get_input_embeddings().weight.shape[0])
     rows = make_rows(layout, options.rollouts, options.turns or LAYOUTS[layout], vocabulary)

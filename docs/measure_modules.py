@@ -27,7 +27,7 @@ MAX_TOKENS = 32
 
 def methods() -> list[str]:
     """Every reasoner that calls a model, and every reflection under ``direct``."""
-    reasoners = [name for name, entry in REGISTRY.entries["reasoning"].items() if not entry.envs]
+    reasoners = [name for name, entry in REGISTRY.entries["reasoning"].items() if not entry.scripted]
     return [*reasoners, *(f"direct+{name}" for name in REGISTRY.entries["reflection"] if name != "none")]
 
 

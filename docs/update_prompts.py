@@ -43,7 +43,7 @@ def methods() -> dict[str, dict[str, Any]]:
     """Page -> spec: every reasoner, and every reflector around `direct`."""
     pages: dict[str, dict[str, Any]] = {}
     for name, entry in REGISTRY.all("reasoning").items():
-        if not entry.envs and entry.target.startswith("agentspec."):
+        if not entry.scripted and entry.target.startswith("agentspec."):
             preset = {"preset": "rl"} if name in ("tot", "rap", "lats") else {}
             pages[name] = {"reasoning": {"name": name, **preset}, "memory": "base"}
     pages["plan_and_solve-persistent"] = {"reasoning": {"name": "plan_and_solve", "persistent": True}, "memory": "base"}

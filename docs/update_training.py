@@ -7,6 +7,7 @@ from pathlib import Path
 from agentspec.files import write_atomic
 from trainers.estimators import ESTIMATORS
 from trainers.losses import LOSSES, REFUSED
+from trainers.writes import WRITE_CREDITS
 
 PAGE = Path(__file__).with_name("training.md")
 
@@ -18,6 +19,14 @@ def estimator_table() -> str:
         reads = ", ".join(f"`{n}`" for n in spec.needs if n != "anchors")
         per, zero = ("step" if spec.per_step else "episode"), ("yes" if spec.zero_sum else "no")
         rows.append(f"| `{name}` | {spec.summary} | {per} | {zero} | {reads} |")
+    return "\n".join(rows) + "\n"
+
+
+def write_table() -> str:
+    """Every estimator of a write to memory, and what it reads."""
+    rows = ["| `write_credit` | what a write earns | reads |", "|---|---|---|"]
+    for name, spec in WRITE_CREDITS.items():
+        rows.append(f"| `{name}` | {spec.summary} | {', '.join(f'`{n}`' for n in spec.reads)} |")
     return "\n".join(rows) + "\n"
 
 
@@ -37,7 +46,7 @@ def loss_table() -> str:
 
 def updated(page: str) -> str:
     """The page with its tables as the code declares them."""
-    for name, table in (("estimators", estimator_table()), ("losses", loss_table())):
+    for name, table in (("estimators", estimator_table()), ("writes", write_table()), ("losses", loss_table())):
         before, begin, rest = page.partition(f"<!-- generated: {name} -->")
         _, end, after = rest.partition("<!-- end -->")
         page = f"{before}{begin}\n{table}{end}{after}"

@@ -192,29 +192,33 @@ def compare_runs(
     trained (a start, an expert), pass it as one run: the unit is then the run of `a`, one sample. Otherwise the runs at
     hand are compared over seeds, and the note says `this checkpoint only`.
     """
-    from scipy import stats
-
     common = _common([*a, *b])
-    if len(a) >= LEAST_RUNS and len(b) == 1:
-        gains = [_mean(run, common) - _mean(b[0], common) for run in a]
-        p = float(stats.ttest_1samp(gains, 0.0).pvalue) if len(set(gains)) > 1 else float(gains[0] == 0)
-        return replace(mean_interval(gains, level=level, unit="run"), p=p)
-    if min(len(a), len(b)) >= LEAST_RUNS:
+    if len(a) >= LEAST_RUNS and (len(b) == 1 or len(b) >= LEAST_RUNS):
+        if not common:
+            return Estimate(math.nan, math.nan, math.nan, 0, "run")
         return _welch([_mean(run, common) for run in a], [_mean(run, common) for run in b], level)
     sides = [{key: math.fsum(run[key] for run in side) / max(1, len(side)) for key in common} for side in (a, b)]
     return paired(*sides, level=level, seed=seed)
 
 
 def _welch(a: Values, b: Values, level: float) -> Estimate:
-    """Welch's unequal-variances t interval and test of the difference of two means."""
+    """Welch's unequal-variances t interval and test of the difference of two means; a lone `b` is taken as exact.
+
+    Where no side varies beyond float noise there is nothing to test: `p` is 1 for equal means, else 0.
+    """
     from scipy import stats
 
-    found = stats.ttest_ind(a, b, equal_var=False)
-    mean = float(np.mean(a) - np.mean(b))
-    if math.isnan(found.pvalue):  # no variance on either side
-        return Estimate(mean, mean, mean, min(len(a), len(b)), "run", float(mean == 0))
+    x, y = _finite(a, level), _finite(b, level)
+    noise = 1e-12 * max(1.0, float(np.abs([*x, *y]).max()))
+    mean = float(x.mean() - y.mean())
+    if np.ptp(x) <= noise and np.ptp(y) <= noise:
+        return Estimate(mean, mean, mean, min(n for n in (x.size, y.size) if n > 1), "run", float(abs(mean) <= noise))
+    if y.size == 1:
+        estimate = mean_interval([float(gain) for gain in x - y], level=level, unit="run")
+        return replace(estimate, p=float(stats.ttest_1samp(x - y, 0.0).pvalue))
+    found = stats.ttest_ind(x, y, equal_var=False)
     interval = found.confidence_interval(confidence_level=level)
-    return Estimate(mean, float(interval.low), float(interval.high), min(len(a), len(b)), "run", float(found.pvalue))
+    return Estimate(mean, float(interval.low), float(interval.high), min(x.size, y.size), "run", float(found.pvalue))
 
 
 # -- tables, designs and interactions --------------------------------------------------------------

@@ -21,8 +21,9 @@ def draw_curve(config: Any, trainer: Any) -> None:
     """The reward curve as `reward_curve.png` in the run's folder (main process, if the config asks for plots)."""
     if config.plots and trainer.accelerator.is_main_process:
         from eval.plots import reward_curve
+        from trainers.run_folder import METRICS
 
-        reward_curve(trainer.run_log.read("metrics.jsonl"), trainer.run_log.folder / "reward_curve.png")
+        reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png")
 
 
 def run_recipe(main: Callable[[], None]) -> None:

@@ -3,8 +3,8 @@
     python -m recipes.learning_study --configs recipes/configs/study_grpo.yaml recipes/configs/study_supo.yaml \\
         --seeds 0 1 2 --out runs/study
 
-Every run is a process of its own (``OUT/NAME-sSEED``) and goes on where it stopped; so does the evaluation. What comes
-out: ``study.md`` (gains per training seed and over all of them), ``results.md`` (the whole matrix), ``curves.png``.
+Every run is a process of its own (`OUT/NAME-sSEED`) and goes on where it stopped; so does the evaluation. What comes
+out: `study.md` (gains per training seed and over all of them), `results.md` (the whole matrix), `curves.png`.
 All configs must name the same model, warm start and world: then one starting policy is the baseline of all.
 """
 
@@ -82,11 +82,12 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     """Play the matrix and write tables and curves."""
     from agentspec.files import write_atomic
     from agentspec.llm.models import resolve_adapter
+    from agentspec.tasks import make_tasks
     from eval.matrix import Policy, evaluate
     from eval.plots import learning_curves
     from eval.tables import write_report
     from trainers.config import agent_spec
-    from trainers.rollouts import make_tasks
+    from trainers.run_folder import METRICS
     from trainers.runlog import RunLog
 
     config = next(iter(configs.values()))
@@ -108,7 +109,7 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     write_report(rows, out)
     own = {method: c.spec.label for method, c in configs.items()}
     write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
-    logs = {m: [RunLog(f).read("metrics.jsonl") for f in folders.values()] for m, folders in runs.items()}
+    logs = {m: [RunLog(f).read(METRICS) for f in folders.values()] for m, folders in runs.items()}
     learning_curves(logs, out / "curves.png")
     print((out / "study.md").read_text())
 

@@ -4,7 +4,8 @@
 
 The trained reflector lies in `output_dir`, the frozen actor in its folder `actor`. The table at the end says what
 lessons bring on held-out shifts: each is played, reflected on if it was not good enough, and played again, with the
-reflector as it was before training and as it is after.
+reflector as it was before training and as it is after, and with a lesson that means nothing: any text in its prompt
+changes what a courier does, so a reflector has taught something only where it beats that one.
 """
 
 from __future__ import annotations
@@ -13,10 +14,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from recipes.common import CONFIGS, draw_curve, run_recipe
+
+CONTROL = "The sky was clear in the morning, and a light wind came from the west."
+"""What stands in the place of every lesson in the comparison: as long as a lesson, and no advice."""
 
 
 def main() -> None:
@@ -43,26 +48,34 @@ def _unscored(runner: Any, jobs: Any) -> list[Any]:
 
 
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
-    """Two trials of every held-out task with either reflector: rows, also in `folder` with their table."""
+    """Two trials of every held-out task with each reflector and without one (`CONTROL`): rows, also in `folder`."""
     from agentspec.episode import Job, Runner
     from agentspec.files import write_atomic
+    from agentspec.spec import ModuleSpec
+    from agentspec.tasks import make_tasks
     from trainers.policy import load_actor_and_reflector
-    from trainers.retroformer import has_lesson, play_trials, routed_llm
-    from trainers.rollouts import make_tasks
+    from trainers.retroformer import ADAPTERS, has_lesson, play_trials
+    from trainers.rollouts import local_llm
 
     name, options = config.world
     jobs = [Job(task, 0, config.seed) for task in make_tasks(name, options, config.eval_tasks, split="test")]
     spec = replace(config.spec, sampling=replace(config.spec.sampling, **config.evaluation_sampling))
     rows = []
-    for label, run in (("before training", ""), ("after training", folder)):
+    reflection = ModuleSpec(spec.reflection.name, {**spec.reflection.params, "control": CONTROL})
+    without = replace(spec, reflection=reflection)
+    reflectors = (("meaningless lesson", "", without), ("before training", "", spec), ("after training", folder, spec))
+    for label, run, agent in reflectors:
         model, tokenizer = load_actor_and_reflector(config, run)
-        runner = Runner(spec, routed_llm(model, tokenizer), timeout_s=config.env_timeout_s, policy=label)
+        runner = Runner(
+            agent, local_llm(model, tokenizer, adapters=ADAPTERS), timeout_s=config.env_timeout_s, policy=label
+        )
         played = play_trials(partial(_unscored, runner), jobs)
         firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):
             returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]
-            lesson = [c.text for c in last.calls if c.tag.purpose == "reflect"] if has_lesson(last) else []
-            row = {"reflector": label, "task": first.task.key, "seed": first.task.seed, "lesson": "".join(lesson)}
+            written = [c.text for c in last.calls if c.tag.purpose == "reflect"] if agent is spec else [CONTROL]
+            lesson = "".join(written) if has_lesson(last) else ""
+            row = {"reflector": label, "task": first.task.key, "seed": first.task.seed, "lesson": lesson}
             rows.append(row | dict(zip(("first_return", "second_return"), returns, strict=True)))
     write_atomic(folder / "evaluation.jsonl", "".join(json.dumps(row, sort_keys=True) + "\n" for row in rows))
     table = markdown(rows)
@@ -72,7 +85,7 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """Per reflector the mean return of both trials and what the lessons changed; then after less before.
+    """Per reflector the mean return of both trials and what the lessons changed; then each less those before it.
 
     A first trial that was good enough has no second one: it counts with its own return, and a gain of 0. Tasks with a
     trial that failed to run are left out.
@@ -89,8 +102,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         lessons = sum(bool(r["lesson"]) for r in played)
         numbers = [show(e, 2) for e in (*returns, mean_interval(list(gains[label].values())))]
         body.append([label, str(len(played)), str(lessons), *numbers])
-    first, *others = gains
-    difference = [show(paired(gains[label], gains[first]), 2) for label in others]
+    pairs = [(a, b) for b, a in combinations(gains, 2)]
     lines = [
         "# What lessons are worth",
         "",
@@ -98,7 +110,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         "",
         *table(["reflector", "tasks", "lessons", "first trial", "second trial", "gain"], body),
         "",
-        *(f"Paired difference in gain, {a} less {first}: {d}." for a, d in zip(others, difference, strict=True)),
+        *(f"Paired difference in gain, {a} less {b}: {show(paired(gains[a], gains[b]), 2)}." for a, b in pairs),
     ]
     return "\n".join(lines) + "\n"
 

@@ -27,11 +27,11 @@ def train_warmup(config: Any) -> None:
     from trl import SFTConfig
 
     from agentspec.files import write_atomic
-    from trainers.card import model_card
+    from agentspec.tasks import make_tasks
+    from trainers.card import FILE, model_card
     from trainers.config import CHECKPOINTING
     from trainers.demonstrations import DemonstrationTrainer, demonstrate
     from trainers.policy import load_policy
-    from trainers.rollouts import make_tasks
     from trainers.runlog import RunLog
 
     name, options = config.world
@@ -62,7 +62,7 @@ def train_warmup(config: Any) -> None:
     trainer.train()
     trainer.save_model(config.output_dir)
     card = model_card(Path(config.output_dir).name, vars(config), config.spec.to_data(), adapter=bool(config.lora_r))
-    write_atomic(Path(config.output_dir) / "README.md", card)
+    write_atomic(Path(config.output_dir) / FILE, card)
     log = RunLog(Path(config.output_dir))
     log.manifest(config=config.to_dict(), spec=config.spec.to_data(), demonstrations=len(returns))
 

@@ -29,10 +29,10 @@ def main() -> None:
 def evaluate_run(config: object, folder: Path) -> None:
     """Base and trained policy, and the rule-based expert, under every evaluation scaffold of `config`."""
     from agentspec.llm.models import resolve_adapter
+    from agentspec.tasks import make_tasks
     from eval.matrix import Policy, evaluate
     from eval.tables import markdown
     from trainers.config import ScaffoldConfig, agent_spec
-    from trainers.rollouts import make_tasks
 
     assert isinstance(config, ScaffoldConfig)
     name, options = config.world

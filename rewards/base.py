@@ -107,6 +107,9 @@ class RewardSet:
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
         self.weights = dict(weights or {"earning_delta": 1.0})
+        for name, weight in self.weights.items():
+            if not math.isfinite(weight):
+                raise SpecError(f"reward {name!r} has weight {weight}; expected a finite number")
         self._functions = {name: reward_entry(name).load() for name in self.weights}
 
     def score(self, trajectory: Trajectory) -> Score | None:

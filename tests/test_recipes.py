@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -16,7 +17,13 @@ pytest.importorskip("trl")
 
 from trl import GRPOConfig
 
+from agentspec.episode import Job, Runner
+from agentspec.llm.scripted import ScriptedLLM
+from agentspec.prompting import static_prompt
+from agentspec.reasoning.react import FORMAT
 from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
+from agentspec.types import Task
 from recipes.common import CONFIGS, run_recipe
 from trainers.arguments import OURS, merged, parse_config, read_config
 from trainers.checks import notes
@@ -66,8 +73,30 @@ def test_the_paper_s_setting() -> None:
     assert config.use_vllm and config.vllm_mode == "colocate"
     # vLLM does not constrain answers to choices, so the actions are written out.
     assert options["action_mode"] == "native"
-    # 40 turns of a full observation fit into the context.
-    assert config.vllm_max_model_length >= 32_768
+
+
+def tokens(text: str) -> int:
+    """About what a tokenizer that splits numbers into digits makes of a text."""
+    return len(re.findall(r"\d|[A-Za-z]+|[^\w\s]+|\n+", text))
+
+
+def test_the_paper_s_setting_has_room_for_a_model_that_thinks() -> None:
+    """It had 512 tokens for thought and action together, and a window that 28 of its 40 observations fill."""
+    config = parsed("qwen3_4b_paper.yaml", *ON_CPU)
+    name, options = config.world
+    run = Runner(AgentSpec.from_data({"reasoning": "rule_based"}), ScriptedLLM(["-"]))
+    (episode,) = run.run([Job(Task(name, 0, options))])
+    first = episode.transitions[0].input
+    static = tokens(static_prompt(first, FORMAT))
+    seen = [tokens(step.input.text) for step in episode.transitions]
+    assert len(seen) == 40 and static + sum(seen) > config.vllm_max_model_length
+    for spec in (config.spec, *map(AgentSpec.from_data, config.eval_specs)):
+        room = spec.sampling.with_room().max_tokens
+        assert spec.sampling.reasoning_tokens >= 1024 and room == spec.sampling.max_tokens + 1536
+        # So many turns stand in a prompt at most, the open one among them; a memory adds its budget.
+        held = spec.max_turns + 1 if spec.layout == "conversation" else 1
+        most = max(sum(seen[i : i + held]) for i in range(len(seen)))
+        assert static + most + spec.recall_tokens + held * room <= config.vllm_max_model_length
 
 
 def test_overrides_win_and_structures_can_be_given() -> None:

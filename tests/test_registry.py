@@ -49,6 +49,23 @@ def test_names_that_find_nothing_say_what_there_is(kind: str, name: str, message
         REGISTRY.get(kind, name)
 
 
+def test_a_method_with_parts_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "made_up" / "memory" / "parted"
+    folder.mkdir(parents=True)
+    for place in (folder.parent.parent, folder.parent):
+        (place / "__init__.py").write_text("")
+    (folder / "prompts.py").write_text("ASK = 'What is worth keeping?'")
+    (folder / "module.py").write_text(
+        "from agentspec.memory.none import NoMemory\nfrom agentspec.declaration import Declaration\n"
+        "class Parted(NoMemory):\n    declaration = Declaration('has parts')\n"
+    )
+    (folder / "__init__.py").write_text("from made_up.memory.parted.module import NoMemory, Parted\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = Registry("made_up").get("memory", "parted")
+    assert entry.load().__name__ == "Parted" and entry.summary == "has parts"
+    assert list(Registry("made_up").all("memory")) == ["parted"]  # what it only imports is not its own
+
+
 def test_an_alias_is_the_module_it_stands_for() -> None:
     assert REGISTRY.get("memory", "simple").target == "agentspec.memory.base:BaseMemory"
     assert AgentSpec.from_data({"memory": "simple"}).memory == ModuleSpec("base")

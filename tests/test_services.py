@@ -63,6 +63,11 @@ def problems(given: Services) -> dict[str, int]:
         'Here it is:\n```json\n{"text": "hot food", "weight": 2.0, "tags": []}\n```\nGood luck!',
         '<think>{"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2, "more": 1}',
         'a prompt may open it: {"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2}',
+        '[THINK]{"text": "no", "weight": 0}[/THINK]{"text": "hot food", "weight": 2}',
+        '◁think▷{"text": "no", "weight": 0}◁/think▷{"text": "hot food", "weight": 2}',
+        '<think><think>a</think>{"text": "no", "weight": 0}</think>{"text": "hot food", "weight": 2}',
+        '<|channel|>analysis<|message|>{"text": "no", "weight": 0}<|end|><|start|>assistant<|channel|>final<|message|>'
+        '{"text": "hot food", "weight": 2}',
         'As in {the rules}, [see above]: {"text": "hot food", "weight": 2} and so on {"text": "b", "weight": 1}',
     ],
 )
@@ -136,6 +141,13 @@ def test_an_answer_is_free_of_the_actions_constraints_and_typed() -> None:
     assert answer.value == Note("a", 1.0) and answer.problem == "" and problems(given) == {}
     (call,) = given.llm.recorder.calls
     assert call.sampling.stop == () and call.sampling.choices == () and call.tag.path == "memory.m/note"
+
+
+def test_thoughts_are_no_part_of_an_answer_in_words() -> None:
+    """In the blocks of every family of models, and where the room ended within one."""
+    for answer in ("<think>a lot</think>Rest.", "[THINK]a lot[/THINK]Rest.", "a lot</think>Rest.", "Rest.<|im_end|>"):
+        assert ask(services(answer)).value == "Rest."
+    assert ask(services("[THINK]a lot, and no end")).problem == "malformed"
 
 
 def test_one_repair_with_the_reason() -> None:

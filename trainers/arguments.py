@@ -9,6 +9,8 @@ since parameters belong to the module they are named with. Options of the comman
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,6 +32,7 @@ OURS = {
     "agent and world": "agent environment train_tasks memory_carry start_memory retries env_timeout_s "
     "rollout_concurrency batching",
     "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
+    "write_credit write_calls write_rerolls write_points "
     "normalize overlong overlong_ends mask_truncated packing tokens_per_forward",
     "evaluation": "eval_tasks eval_specs eval_sampling validation_tasks validation_specs",
     "this run": "resume plots",
@@ -113,6 +116,13 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
+def described(config: type) -> dict[str, str]:
+    """Field -> what the docstring of its class says under `Args:`."""
+    args = (inspect.getdoc(config) or "").partition("Args:\n")[2]
+    paragraphs = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", args, re.MULTILINE)
+    return {name: " ".join(text.split()).replace("%", "%%") for name, text in paragraphs}
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise SpecError(f"{message}; a configuration is given as `--config FILE`")
@@ -125,6 +135,9 @@ class _ConfigParser(TrlParser):
         self._source = source
         usage = "%(prog)s [--config FILE] [--FIELD VALUE ...]"
         super().__init__((config,), allow_abbrev=False, usage=usage, description=description)
+        said = described(config)
+        for action in self._actions:
+            action.help = said.get(action.dest, action.help)
 
     def error(self, message: str) -> NoReturn:
         raise SpecError(f"{self._source}: {message}; `--help` lists every field")

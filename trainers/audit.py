@@ -8,7 +8,8 @@ compared field by field, so that
   its constraint left, with the recorded log-probability and temperature (`trainers.provenance`);
 - masks cover model tokens only, and none that a constraint forced;
 - the advantage of every row is what the declared estimator gives for the returns, and those of a group sum to zero
-  where the estimator says so;
+  where the estimator says so; what a write to memory earned is what the episodes played for it say, and these are
+  what they claim to be (`trainers.counterfactuals`);
 - the loss denominator is what the loss divides by (`trainers.losses`); padding rows train nothing; rollouts that could
   not be scored have no rows; the settings of the loss are those of the manifest.
 """
@@ -25,6 +26,8 @@ from typing import Any
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers.chain import Manifests, check_end, files_of, linked_receipts, read_round
+from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
+from trainers.counterfactuals import attach
 from trainers.credit import CreditRule
 from trainers.estimators import estimator
 from trainers.losses import UpdateSize, loss
@@ -127,27 +130,32 @@ def _audit_update(
     config = manifests.of(record, problems)["config"]
     try:
         finding.denominator, finding.padding_rows = int(record["denominator"]), int(record["padding_rows"])
-        episodes = read_round(folder, record, problems)
+        read = read_round(folder, record, problems)
+        episodes, beside = read[TRAJECTORIES], read[COUNTERFACTUALS]
         finding.episodes = len(episodes)
         finding.unscorable = sum(not t.scorable for t in episodes)
         if not episodes:
             problems.append(f"the episodes of this update are missing ({folder / TRAJECTORIES})")
             return finding
-        _check_update(finding, record, episodes, config)
+        _check_update(finding, record, episodes, beside, config)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         problems.append(f"the record cannot be followed ({type(error).__name__}: {error})")
     return finding
 
 
 def _check_update(
-    finding: UpdateAudit, record: Mapping[str, Any], episodes: Sequence[Trajectory], config: Mapping[str, Any]
+    finding: UpdateAudit,
+    record: Mapping[str, Any],
+    episodes: Sequence[Trajectory],
+    beside: Sequence[Trajectory],
+    config: Mapping[str, Any],
 ) -> None:
     """The receipt, made anew from its episodes and the manifest, and what it may not contain."""
     rule = CreditRule.from_manifest(config)
     if len(episodes) % rule.group:
         finding.violations.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
         return
-    scored = rule.score(episodes)
+    scored = attach(rule.score(episodes), beside, rule, finding.violations)
     rows = rule.credit(scored).rows
     finding.rows = len(rows)
     finding.zero_gradient_rows = sum(r.zero_gradient for r in rows)
@@ -226,7 +234,8 @@ def _check_advantages(
         return
     values: dict[int, float] = {}
     for row in rows:
-        if not isinstance(row.advantage, float) or values.setdefault(row.episode, row.advantage) != row.advantage:
+        of_actions = _of_actions(row, rule)
+        if len(of_actions) > 1 or any(values.setdefault(row.episode, a) != a for a in of_actions):
             finding.violations.append(f"episode {row.episode} has rows with different advantages")
     if rule.normalize == "rollout" or not spec.zero_sum:
         return  # each rollout's value is scaled by its own length; they were compared one by one already
@@ -238,6 +247,15 @@ def _check_advantages(
                 finding.violations.append(
                     f"advantages of group {start // rule.group} sum to {math.fsum(given):.2g}, not 0"
                 )
+
+
+def _of_actions(row: Row, rule: CreditRule) -> set[float]:
+    """The advantages of a row's trained tokens, but for those of writes that are credited by themselves."""
+    if isinstance(row.advantage, float):
+        return {row.advantage}
+    s = row.sequence
+    wrote = {c for c, path in s.paths.items() if rule.writes.spec.function and rule.writes.is_write(path)}
+    return {a for a, m, c in zip(row.advantage, s.mask, s.calls, strict=True) if m and c not in wrote}
 
 
 def _check_samples(finding: UpdateAudit, rows: Sequence[Row], episodes: Sequence[Trajectory]) -> None:

@@ -1,6 +1,6 @@
 """What an update does to each kind of call: which parts of the scaffold reinforcement learning changes.
 
-Trained tokens are counted by the ``module/purpose`` path of the call that wrote them. An update that moves the
+Trained tokens are counted by the `module/purpose` path of the call that wrote them. An update that moves the
 summaries and leaves the actions alone shows here, and nowhere else.
 """
 
@@ -58,8 +58,8 @@ class CallMetrics:
     def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
         """Metrics of what was counted since the last time, over all ranks.
 
-        Per path: ``tokens`` (trained), ``advantage_mass`` (its share of the sum of absolute advantages over trained
-        tokens), ``entropy`` (mean, nats), ``clip_share`` (of its tokens).
+        Per path: `tokens` (trained), `advantage_mass` (its share of the sum of absolute advantages over trained
+        tokens), `entropy` (mean, nats), `clip_share` (of its tokens).
         """
         everywhere: dict[str, CallTotals] = {}
         for path, totals in gather(list(self._totals.items())):

@@ -7,6 +7,7 @@ author did not compute all later digests anew. Who did can be told by the head o
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers.contents import contents, differing, field_digests
+from trainers.digests import differing, field_digests
 from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES, checkpoints
 from trainers.runlog import FORMAT, round_files, seal_of
 
@@ -120,16 +121,19 @@ def files_of(record: Mapping[str, Any]) -> dict[str, Any]:
     return dict(files) if isinstance(files, Mapping) else {}
 
 
-def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> list[Trajectory]:
-    """The episodes of a receipt's round in the order of the global batch; every edit of a file of the round is told."""
+def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> dict[str, list[Trajectory]]:
+    """The episodes of a receipt's round by the run's folder they lie in, each in the order of the global batch.
+
+    Every edit of a file of the round is told.
+    """
     present = {p.relative_to(folder).as_posix(): p for p in round_files(folder)}
-    episodes: list[Trajectory] = []
+    episodes: dict[str, list[Trajectory]] = defaultdict(list)
     for name, stated in sorted(files_of(record).items(), key=lambda item: (_rank(item[0]), item[0])):
         if name not in present:
             problems.append(f"{name} is missing")
             continue
         read = _read_file(present[name], name, stated if isinstance(stated, Mapping) else {}, problems)
-        episodes += read if name.startswith(f"{TRAJECTORIES}/") else []
+        episodes[name.partition("/")[0]] += read
     return episodes
 
 
@@ -147,7 +151,7 @@ def _read_file(path: Path, name: str, stated: Mapping[str, Any], problems: list[
         count += 1
         data = parse_line(path, number, line)
         expected = known[count - 1] if count <= len(known) else {}
-        edited = differing(expected, contents(data))
+        edited = differing(expected, field_digests(data))
         try:
             episodes.append(Trajectory.from_data(data))
             which = f"record {number} ({episodes[-1].episode})"
@@ -183,6 +187,10 @@ def check_end(
         name = path.relative_to(folder).as_posix()
         if name not in named and (sealed or not int(path.name[:6]) > last):
             problems.append(f"{name}: no receipt names it")
+    known = {p.name for p in round_files(folder)}
+    for path in sorted((folder / TRAJECTORIES).glob("*")):
+        if path.name not in known and not path.name.startswith("."):
+            problems.append(f"{TRAJECTORIES}/{path.name}: no receipt names it, and no round has a file of that name")
     reached = max((number + steps for number, _, steps in receipts), default=0)
     steps = {METRICS: max((_step(line) for _, line in whole_lines(folder / METRICS)), default=0)}
     steps |= {p.name: int(p.name.removeprefix(f"{CHECKPOINT}-")) for p in checkpoints(folder)}
@@ -219,7 +227,12 @@ def _check_seal(folder: Path, head: str) -> tuple[list[str], list[str]]:
         return [f"{SEAL} is no seal"], []
     for name in sorted({*seal, *expected}):
         if seal.get(name) != expected.get(name):
-            problems += _log_problems(seal.get(name), expected[name]) if name == "logs" else [_SEALED.get(name, name)]
+            if name == "logs":
+                problems += _log_problems(seal.get(name), expected[name])
+            elif name == "sizes":
+                problems += _size_problems(seal.get(name), expected[name])
+            else:
+                problems.append(_SEALED.get(name, name))
     if not problems and blob != (json.dumps(expected, indent=1, sort_keys=True) + "\n").encode():
         problems.append(f"{SEAL}: its bytes were edited")
     if head and digest(blob) != head:
@@ -233,6 +246,16 @@ _SEALED = {
     "manifest": f"{MANIFEST} is not the one that {SEAL} names (`manifest`)",
     "format": f"{SEAL}: `format` was edited",
 }
+
+
+def _size_problems(sealed: Any, found: Mapping[str, int]) -> list[str]:
+    if not isinstance(sealed, Mapping):
+        return [f"{SEAL}: `sizes` was edited"]
+    return [
+        f"{name} has {found.get(name, 0)} bytes, {SEAL} says {sealed.get(name, 0)} (`sizes`)"
+        for name in sorted({*sealed, *found})
+        if sealed.get(name) != found.get(name)
+    ]
 
 
 def _log_problems(sealed: Any, found: Mapping[str, list[str]]) -> list[str]:

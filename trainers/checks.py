@@ -7,6 +7,7 @@ a mistake is told before a model is loaded; what shows only later is refused whe
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Collection, Iterable
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args
@@ -21,7 +22,8 @@ from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import field_rules
 from trainers.losses import LOSSES, loss
-from trainers.sequences import unmatched_patterns
+from trainers.sequences import TrainFilter, unmatched_patterns
+from trainers.writes import write_credit
 
 if TYPE_CHECKING:
     from trainers.config import ScaffoldConfig
@@ -30,8 +32,8 @@ ENDS = ("context", "budget", "max_steps", "truncated")
 TOKEN_MODES = ("token_truncate", "token_mask")
 REFLECTION, REWARD = "retroformer", "reflection_gain"
 LORA_FIELDS = ("lora_r", "lora_alpha", "lora_targets", "lora_layers")
-REPORTERS = {"tensorboard": "tensorboard", "wandb": "wandb"}
-"""Where logs may go, by the extra that installs it."""
+REPORTERS = ("tensorboard", "wandb")
+"""Where logs may go, each the name of the extra that installs it."""
 
 
 def check(config: ScaffoldConfig) -> None:
@@ -46,6 +48,9 @@ def check(config: ScaffoldConfig) -> None:
     check_names(config)
     check_calls(config)
     check_lora(config)
+    check_actor(config)
+    check_ranges(config)
+    check_writes(config)
     check_loss(config)
     check_rounds(config)
     check_validation(config)
@@ -91,10 +96,9 @@ def _refuse_field(name: str, value: Any) -> None:
 def check_reporters(config: Any) -> None:
     """What logs are sent through is installed."""
     for name in [config.report_to] if isinstance(config.report_to, str) else config.report_to or []:
-        extra = REPORTERS.get(name)
-        if extra and importlib.util.find_spec(name) is None:
+        if name in REPORTERS and importlib.util.find_spec(name) is None:
             raise SpecError(
-                f"report_to names {name}, which is not installed; pip install 'agentspec-rl[{extra}]', or set "
+                f"report_to names {name}, which is not installed; pip install 'agentspec-rl[{name}]', or set "
                 "`report_to: none`"
             )
 
@@ -131,6 +135,12 @@ def check_calls(config: ScaffoldConfig) -> None:
             f"train_calls {missing} match no call of this scaffold, so nothing would be trained by them; its calls "
             f"come from {', '.join(sorted(set(paths))) or 'no module (none calls the model)'}"
         )
+    nowhere = unmatched_patterns(paths, TrainFilter(tuple(config.mask_truncated)))
+    if nowhere:
+        raise SpecError(
+            f"mask_truncated {nowhere} match no call of this scaffold, so nothing would be masked by them; its calls "
+            f"come from {', '.join(sorted(set(paths)))}"
+        )
     if "images" in spec.needs():
         raise SpecError(
             "agent.perception has images: true, and the policy that is trained reads text only (pictures have no token "
@@ -155,9 +165,52 @@ def check_calls(config: ScaffoldConfig) -> None:
         )
 
 
+WRITE_FIELDS = ("write_rerolls", "write_points")
+
+
+def check_writes(config: ScaffoldConfig) -> None:
+    """Estimators of a write have writes to credit, and no setting of theirs changes nothing."""
+    spec = write_credit(config.write_credit)
+    for name in WRITE_FIELDS:
+        if getattr(config, name) < 1:
+            raise SpecError(f"{name} is {getattr(config, name)}; expected at least 1")
+        if getattr(config, name) != _default(config, name) and name not in spec.reads:
+            raise SpecError(
+                f"{name} {getattr(config, name)} changes nothing with write_credit {spec.name!r}; leave it out, or set "
+                "`write_credit: local`"
+            )
+    if spec.function is None:
+        if config.write_calls != _default(config, "write_calls"):
+            raise SpecError(
+                f"write_calls {config.write_calls} changes nothing with write_credit 'episode'; leave it out"
+            )
+        return
+    agent = config.spec
+    if agent.roles and spec.reads:
+        raise SpecError(
+            f"write_credit {spec.name!r} with roles {list(agent.roles)}: an episode is played again from its recorded "
+            "answers, and those of helper models are not given back; use `write_credit: ablation`, or no helper"
+        )
+    helped = {m for pattern in agent.roles for m in agent.helped(pattern)}
+    paths = [p for p in agent.call_paths() if p.startswith("memory.") and p.partition("/")[0] not in helped]
+    trained = [p for p in paths if config.train_filter.matches(p) and TrainFilter(tuple(config.write_calls)).matches(p)]
+    if not trained:
+        raise SpecError(
+            f"write_credit {spec.name!r}, but no call of memory {agent.memory.name!r} is both trained (train_calls "
+            f"{config.train_calls}) and a write (write_calls {config.write_calls}); its calls are "
+            f"{', '.join(paths) or 'none that the policy answers'}; add 'memory.*' to train_calls"
+        )
+
+
 def check_lora(config: ScaffoldConfig) -> None:
-    """A warm start keeps the shape it was made with."""
+    """A warm start keeps the shape it was made with, and all weights have no shape of an adapter."""
     if not config.adapter:
+        for name in LORA_FIELDS[1:]:
+            if config.lora_r == 0 and getattr(config, name) != _default(config, name):
+                raise SpecError(
+                    f"{name} is {getattr(config, name)!r} with lora_r 0, which trains all weights, without an adapter; "
+                    f"leave out {name}, or give lora_r a rank"
+                )
         return
     if config.lora_r == 0:
         raise SpecError(
@@ -171,9 +224,62 @@ def check_lora(config: ScaffoldConfig) -> None:
             )
 
 
+def check_actor(config: ScaffoldConfig) -> None:
+    """What belongs to a frozen actor, or to a memory that is carried on, has one."""
+    spec = config.spec
+    for name in ("actor_adapter", "actor_temperature"):
+        if getattr(config, name) != _default(config, name) and spec.reflection.name != REFLECTION:
+            raise SpecError(
+                f"{name} is {getattr(config, name)!r}, and there is no frozen actor: only a reflector that is trained "
+                f"(`reflection: {REFLECTION}`) acts beside one; leave out {name}"
+            )
+    if config.memory_carry != _default(config, "memory_carry") and spec.scope != "run":
+        raise SpecError(
+            f"memory_carry {config.memory_carry!r} changes nothing with agent.scope {spec.scope!r}: no memory outlives "
+            "its episode; leave it out, or set `agent: {scope: run}`"
+        )
+
+
+RANGES: dict[str, tuple[float, float]] = {
+    "gamma": (0.0, 1.0),
+    "gigpo_weight": (0.0, math.inf),
+    "epsilon": (0.0, math.inf),
+    "epsilon_high": (0.0, math.inf),
+    "beta": (0.0, math.inf),
+    "top_entropy_quantile": (0.0, 1.0),
+    "learning_rate": (0.0, math.inf),
+    "max_completion_length": (1, math.inf),
+    "num_iterations": (1, math.inf),
+    "train_tasks": (1, math.inf),
+    "tokens_per_forward": (0, math.inf),
+    "rollout_concurrency": (0, math.inf),
+    "retries": (0, math.inf),
+    "lora_r": (0, math.inf),
+    "lora_layers": (0, math.inf),
+    "lora_alpha": (0, math.inf),
+}
+"""Field -> smallest and largest value that means something."""
+
+
+def check_ranges(config: ScaffoldConfig) -> None:
+    """Every number means something: out of its range it would turn a sign around or be passed over."""
+    for name, (low, high) in RANGES.items():
+        value = getattr(config, name)
+        if value is not None and not (low <= value <= high and math.isfinite(value)):
+            most = "" if math.isinf(high) else f" and at most {high:g}"
+            raise SpecError(f"{name} is {value}; expected a number of at least {low:g}{most}")
+
+
 def check_loss(config: ScaffoldConfig) -> None:
     """The loss is offered, and no setting of it or of the estimator changes nothing."""
     spec = loss(config.loss_type)
+    if config.reference != _default(config, "reference") and config.beta == 0:
+        raise SpecError(f"reference {config.reference!r} changes nothing with beta 0; leave it out, or set beta")
+    if config.epsilon != _default(config, "epsilon") and config.epsilon_high and "epsilon" not in spec.uses:
+        raise SpecError(
+            f"epsilon {config.epsilon} changes nothing with loss_type {spec.name!r}, which reads epsilon_high; "
+            "leave it out"
+        )
     if config.delta is not None and "delta" not in spec.uses:
         raise SpecError(f"delta {config.delta} changes nothing with loss_type {spec.name!r}; leave it out")
     for name in ("gamma", "gigpo_weight"):
@@ -206,6 +312,11 @@ def check_rounds(config: ScaffoldConfig) -> None:
 def check_validation(config: ScaffoldConfig) -> None:
     """A checkpoint exists of whatever update turns out best."""
     if not config.validates:
+        if config.validation_specs:
+            raise SpecError(
+                "validation_specs changes nothing without evaluation while training; set `eval_strategy: steps`, or "
+                "name them as eval_specs"
+            )
         return
     if config.validation_tasks < 1:
         raise SpecError(f"validation_tasks is {config.validation_tasks}: evaluation while training needs at least 1")
@@ -252,11 +363,7 @@ def _check_batch_invariant(config: ScaffoldConfig) -> None:
 
 
 def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, and what to set.
-    """
+    """Refuse what does not train a reflector beside a frozen actor."""
     spec = config.spec
     if spec.reflection.name != REFLECTION:
         raise SpecError(
@@ -267,6 +374,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
             "a lesson and the trial that pays it must be one episode that starts from the failed trial's memory: set "
             f"`reflection: {{name: {REFLECTION}, when: start}}` and `scope: run`"
         )
+    if spec.reflection.params.get("control"):
+        raise SpecError("reflection.control: a fixed text stands for every lesson, so none is sampled; leave it out")
     if spec.reflection.params.get("temperature") == 0:
         raise SpecError("reflection.temperature is 0: all lessons of a group would be the same; set it above 0")
     if config.start_memory:
@@ -275,6 +384,8 @@ def check_retroformer(config: ScaffoldConfig) -> None:
         raise SpecError(f"train_calls {config.train_calls}: the actor is frozen; only [{PATH!r}] is trained")
     if REWARD not in config.reward_set.weights:
         raise SpecError(f"rewards {config.rewards}: a lesson is paid the change of return; give {REWARD!r} a weight")
+    if config.write_credit != "episode":
+        raise SpecError(f"write_credit {config.write_credit!r}: only the lesson is trained, no write of a memory")
     if config.lora_r == 0:
         raise SpecError("lora_r is 0: all weights would be trained, the actor's among them; give the reflector a rank")
     if config.use_vllm:
@@ -295,6 +406,18 @@ def notes(config: ScaffoldConfig) -> list[str]:
     spec = loss(config.loss_type)
     if spec.depends_on_rows:
         found.append(f"loss_type {spec.name}: {spec.depends_on_rows}; 'dapo' does not depend on rows")
+    cap = config.epsilon if config.epsilon_high is None else config.epsilon_high
+    if spec.name == "cispo" and cap < 1:
+        found.append(
+            f"loss_type cispo: epsilon_high {cap:g} is a bound of the ratio itself, so every token near its ratio of 1 "
+            f"is capped and its gradient is {cap:g} of the policy gradient; its authors' bound is 5"
+        )
+    memory = [p for p in config.spec.call_paths() if p.startswith("memory.") and config.train_filter.matches(p)]
+    if memory and "aux" not in config.train_credits and config.spec.memory.name != "summary":
+        found.append(
+            f"train_calls match {', '.join(memory)}, and train_credits {config.train_credits} lack 'aux': what a "
+            "memory asks is help unless it says otherwise, so nothing of it is trained"
+        )
     if config.top_entropy_quantile < 1:
         found.append("top_entropy_quantile: the quantile is of each micro-batch, so it depends on how rows are split")
     return found

@@ -1,6 +1,7 @@
-"""The configuration of a run: TRL's ``GRPOConfig`` plus what the scaffold adds, in one dataclass.
+"""The configuration of a run: TRL's `GRPOConfig` plus what the scaffold adds, in one dataclass.
 
-`trainers.arguments` fills it from a YAML file and from the command line; no other class mirrors it. What cannot work
+`trainers.arguments` fills it from a YAML file and from the command line, and its docstring is what `--help` says of
+each field; no other class mirrors it. What cannot work
 or would not be exact is refused at start, with the reason and the remedy (`trainers.checks`).
 """
 
@@ -18,7 +19,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
 from trainers.checks import check
-from trainers.estimators import ESTIMATORS
+from trainers.credit import CreditRule
 from trainers.sequences import TrainFilter
 
 CHECKPOINTING = (
@@ -29,107 +30,113 @@ CHECKPOINTING = (
 
 @dataclass
 class ScaffoldConfig(GRPOConfig):
-    """``trl.GRPOConfig`` and what training inside a scaffold needs.
+    """`trl.GRPOConfig` and what training inside a scaffold needs.
 
     Args:
-        model: what :func:`agentspec.llm.models.resolve` understands: a folder, ``smollm2-135m`` or a hub id.
+        model: what `agentspec.llm.models.resolve` understands: a folder, `smollm2-135m` or a hub id.
         adapter: PEFT folder to start from (a warm start), or empty.
         actor_adapter: training a reflector: PEFT folder of the frozen actor, or empty (the base model acts).
         actor_temperature: training a reflector: sampling temperature of the actor; lessons have the agent's.
         agent: the agent spec: a mapping, or a path to a YAML file.
-        environment: ``{name: ..., options: {...}}``: the world and its ``gymnasium.make`` arguments.
-        train_tasks: number of distinct training tasks (seeds ``0 .. train_tasks - 1``).
-        eval_tasks: number of held-out tasks (seeds ``20000 ..``) for evaluation after training.
-        train_calls: patterns over ``module/purpose`` of the calls that are trained.
-        train_credits: credits that are trained (``executed``, ``explored``, ``aux``).
-        rewards: weight by registered reward; default ``{earning_delta: 1.0}``.
-        reference: with ``beta`` above 0, what the policy is kept near: the ``initial`` policy, as training began (its
-            adapter included), or the ``base`` model without any adapter.
-        estimator: how returns become advantages: a name in :data:`~trainers.estimators.ESTIMATORS`.
+        environment: `{name: ..., options: {...}}`: the world and its `gymnasium.make` arguments.
+        train_tasks: number of distinct training tasks (seeds `0 .. train_tasks - 1`).
+        eval_tasks: number of held-out tasks (seeds `20000 ..`) for evaluation after training.
+        train_calls: patterns over `module/purpose` of the calls that are trained.
+        train_credits: credits that are trained (`executed`, `explored`, `aux`).
+        rewards: weight by registered reward; default `{earning_delta: 1.0}`.
+        reference: with `beta` above 0, what the policy is kept near: the `initial` policy, as training began (its
+            adapter included), or the `base` model without any adapter.
+        estimator: how returns become advantages: a name in `trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
-        gigpo_weight: weight of the step advantage in ``gigpo``.
+        gigpo_weight: weight of the step advantage in `gigpo`.
         skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
-        normalize: ``token`` weighs every trained token alike (an episode that trains more tokens counts more);
-            ``rollout`` weighs every rollout alike, so that call-heavy scaffolds do not inflate the loss.
-        overlong: what happens to episodes that ended for a reason in ``overlong_ends``: ``mask`` (zero loss, still in
-            the baseline: SUPO's default), ``keep`` or ``drop`` (neither loss nor baseline).
-        overlong_ends: ends that make an episode overlong: ``context``, ``budget``, ``max_steps``, ``truncated``.
+        normalize: `token` gives every trained token the same weight (an episode that trains more tokens counts more);
+            `rollout` every rollout, so that call-heavy scaffolds do not inflate the loss.
+        overlong: what happens to episodes that ended for a reason in `overlong_ends`: `mask` (zero loss, still in
+            the baseline: SUPO's default), `keep` or `drop` (neither loss nor baseline).
+        overlong_ends: ends that make an episode overlong: `context`, `budget`, `max_steps`, `truncated`.
         mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
-        memory_carry: with ``scope: run``, whose memory a task carries on: that of its ``first`` rollout in a round, or
-            of its ``best``. All rollouts of a task start from the same memory; tasks share none.
-        start_memory: with ``scope: run``, a memory file or the folder of a run that wrote one (`memory.json`), to start
+        memory_carry: with `scope: run`, whose memory a task carries on: that of its `first` rollout in a round, or
+            of its `best`. All rollouts of a task start from the same memory; tasks share none.
+        start_memory: with `scope: run`, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
+        write_credit: what trained calls of memory earn, a name in `trainers.writes.WRITE_CREDITS`: what the
+            `episode` does, `local` re-rolls with and without the write, or the `ablation` of the whole memory.
+        write_calls: patterns of the calls that write (those of memory; narrow it to leave out what only recalls).
+        write_rerolls: with `local`: re-rolls with, and as many without, each write that is looked at.
+        write_points: with `local`: most writes of an episode that are looked at; the others earn 0.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: ``continuous`` at any time, ``closed``
-            never, so that runs repeat on every device; ``auto`` is ``continuous`` where that repeats to the last bit
-            (a CPU in float32), else ``closed``, with a warning (`agentspec.llm.batching`).
-        packing: ``tree`` computes shared prefixes of the update once, ``padded`` computes every row; gradients agree.
+        batching: when the local backend takes requests into a running batch: `continuous` at any time, `closed`
+            never, so that runs repeat on every device; `auto` is `continuous` where that repeats to the last bit
+            (a CPU in float32), else `closed`, with a warning (`agentspec.llm.batching`).
+        packing: `tree` computes shared prefixes of the update once, `padded` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
         lora_r: rank of a new LoRA adapter; 0 trains all weights.
         lora_alpha: scale of the adapter (0: twice the rank).
-        lora_targets: module names that carry LoRA (``all-linear`` or a list).
+        lora_targets: module names that carry LoRA (`all-linear` or a list).
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
-        vllm_importance_sampling_mode: how a token is weighed for having been sampled by vLLM's kernels and not the
-            trainer's: ratio clipped at ``vllm_importance_sampling_clip_max`` (``token_truncate``) or 0 beyond it
-            (``token_mask``); both need ``vllm_importance_sampling_correction``.
+        vllm_importance_sampling_mode: the importance ratio of a token that was sampled by vLLM's kernels and not the
+            trainer's: clipped at `vllm_importance_sampling_clip_max` (`token_truncate`) or 0 beyond it
+            (`token_mask`); both need `vllm_importance_sampling_correction`.
         vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
             runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
-        validation_tasks: number of held-out tasks (seeds ``10000 ..``) that are played every ``eval_steps`` updates
-            with ``eval_strategy: steps``; the best checkpoint by ``metric_for_best_model`` (default ``reward``, the
-            mean under the training scaffold) is kept, and is the result with ``load_best_model_at_end``.
+        validation_tasks: number of held-out tasks (seeds `10000 ..`) that are played every `eval_steps` updates
+            with `eval_strategy: steps`; the best checkpoint by `metric_for_best_model` (default `reward`, the
+            mean under the training scaffold) is kept, and is the result with `load_best_model_at_end`.
         validation_specs: further agent specs to validate under, beside the training scaffold.
         plots: write the reward curve as PNG when training ends.
-        resume: continue from the last checkpoint in ``output_dir``.
+        resume: continue from the last checkpoint in `output_dir`.
     """
 
-    model: str = field(default="smollm2-135m", metadata={"help": "folder, bundled name or hub id"})
-    adapter: str = field(default="", metadata={"help": "PEFT folder to start from"})
-    actor_adapter: str = field(default="", metadata={"help": "PEFT folder of the frozen actor beside a reflector"})
-    actor_temperature: float = field(default=0.0, metadata={"help": "temperature of the actor beside a reflector"})
-    agent: dict[str, Any] | str | None = field(default=None, metadata={"help": "agent spec: mapping or YAML path"})
-    environment: dict[str, Any] | str | None = field(default=None, metadata={"help": "{name, options} of the world"})
-    train_tasks: int = field(default=64, metadata={"help": "number of distinct training tasks"})
-    eval_tasks: int = field(default=16, metadata={"help": "number of held-out tasks"})
+    model: str = "smollm2-135m"
+    adapter: str = ""
+    actor_adapter: str = ""
+    actor_temperature: float = 0.0
+    agent: dict[str, Any] | str | None = None
+    environment: dict[str, Any] | str | None = None
+    train_tasks: int = 64
+    eval_tasks: int = 16
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
     train_credits: list[str] = field(default_factory=lambda: ["executed"])
-    rewards: dict[str, float] | str | None = field(default=None, metadata={"help": "reward name -> weight"})
-    estimator: str = field(default="grpo", metadata={"help": ", ".join(ESTIMATORS)})
-    reference: str = field(default="initial", metadata={"help": "initial or base; with beta above 0"})
-    gamma: float = field(default=1.0, metadata={"help": "discount per step of step-level estimators"})
-    gigpo_weight: float = field(default=1.0, metadata={"help": "weight of GiGPO's step advantage"})
-    skip_zero_variance: bool = field(default=False, metadata={"help": "drop groups without variance"})
-    normalize: str = field(default="token", metadata={"help": "token or rollout"})
-    overlong: str = field(default="mask", metadata={"help": "mask, keep or drop"})
+    rewards: dict[str, float] | str | None = None
+    estimator: str = "grpo"
+    reference: str = "initial"
+    gamma: float = 1.0
+    gigpo_weight: float = 1.0
+    skip_zero_variance: bool = False
+    normalize: str = "token"
+    overlong: str = "mask"
     overlong_ends: list[str] = field(default_factory=lambda: ["context"])
     mask_truncated: list[str] = field(default_factory=list)
-    memory_carry: str = field(default="first", metadata={"help": "first or best"})
-    start_memory: str = field(default="", metadata={"help": "memory file or run folder to start from"})
-    retries: int = field(default=0, metadata={"help": "runs of a failed episode beyond the first"})
-    env_timeout_s: float = field(default=60.0, metadata={"help": "seconds per environment call"})
-    rollout_concurrency: int = field(default=0, metadata={"help": "most episodes at once; 0: all"})
-    batching: str = field(default="auto", metadata={"help": "auto, continuous or closed"})
-    packing: str = field(default="tree", metadata={"help": "tree or padded"})
-    tokens_per_forward: int = field(default=0, metadata={"help": "token budget of one forward; 0: unbounded"})
-    lora_r: int = field(default=16, metadata={"help": "LoRA rank; 0 trains all weights"})
-    lora_alpha: int = field(default=0, metadata={"help": "LoRA alpha; 0: twice the rank"})
+    memory_carry: str = "first"
+    start_memory: str = ""
+    write_credit: str = "episode"
+    write_calls: list[str] = field(default_factory=lambda: ["memory.*"])
+    write_rerolls: int = 2
+    write_points: int = 1
+    retries: int = 0
+    env_timeout_s: float = 60.0
+    rollout_concurrency: int = 0
+    batching: str = "auto"
+    packing: str = "tree"
+    tokens_per_forward: int = 0
+    lora_r: int = 16
+    lora_alpha: int = 0
     lora_targets: list[str] = field(default_factory=lambda: ["all-linear"])
-    lora_layers: int = field(default=0, metadata={"help": "top layers that carry LoRA; 0: all"})
-    # TRL's default weighs whole rows.
-    vllm_importance_sampling_mode: str = field(
-        default="token_truncate", metadata={"help": "token_truncate or token_mask"}
-    )
-    vllm_batch_invariant: bool = field(default=False, metadata={"help": "vLLM's batch-invariant mode"})
-    eval_specs: list[Any] | str | None = field(default=None, metadata={"help": "agent specs to evaluate under"})
-    eval_sampling: dict[str, Any] | str | None = field(default=None, metadata={"help": "sampling at evaluation"})
-    validation_tasks: int = field(default=16, metadata={"help": "number of tasks of an evaluation while training"})
-    validation_specs: list[Any] | str | None = field(default=None, metadata={"help": "further specs to validate under"})
-    plots: bool = field(default=True, metadata={"help": "write the reward curve as PNG"})
-    resume: bool = field(default=False, metadata={"help": "continue from the last checkpoint in output_dir"})
+    lora_layers: int = 0
+    vllm_importance_sampling_mode: str = "token_truncate"  # TRL's default is a ratio of whole rows
+    vllm_batch_invariant: bool = False
+    eval_specs: list[Any] | str | None = None
+    eval_sampling: dict[str, Any] | str | None = None
+    validation_tasks: int = 16
+    validation_specs: list[Any] | str | None = None
+    plots: bool = True
+    resume: bool = False
 
     def __post_init__(self) -> None:
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
@@ -151,17 +158,21 @@ class ScaffoldConfig(GRPOConfig):
         return agent_spec(self.agent)
 
     @property
+    def credit_rule(self) -> CreditRule:
+        """How episodes are credited."""
+        return CreditRule.from_manifest(vars(self))
+
+    @property
     def train_filter(self) -> TrainFilter:
         """Which completions are trained."""
-        credits: Any = tuple(self.train_credits)
-        return TrainFilter(tuple(self.train_calls), credits, tuple(self.mask_truncated))
+        return self.credit_rule.train
 
     @property
     def world(self) -> tuple[str, dict[str, Any]]:
         """Name and options of the environment.
 
         Raises:
-            SpecError: not of the form ``{name: ..., options: {...}}``.
+            SpecError: not of the form `{name: ..., options: {...}}`.
         """
         value = self.environment or "deliverybench"
         given: dict[str, Any] = {"name": value} if isinstance(value, str) else value
@@ -192,13 +203,11 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def reward_set(self) -> RewardSet:
         """The weighted rewards."""
-        if isinstance(self.rewards, str):
-            return RewardSet({self.rewards: 1.0})
-        return RewardSet(self.rewards)
+        return RewardSet(self.credit_rule.rewards)
 
     @property
     def starting_memory(self) -> bytes | None:
-        """The bank of memories that the run starts from (`agentspec.carry`), or ``None`` where it starts from nothing.
+        """The bank of memories that the run starts from (`agentspec.carry`), or `None` where it starts from nothing.
 
         Raises:
             SpecError: no such file, or one of other modules than the agent's.
@@ -206,11 +215,7 @@ class ScaffoldConfig(GRPOConfig):
         return start_bank(self.start_memory, self.spec).dump() if self.start_memory else None
 
     def check(self) -> None:
-        """Refuse what cannot work, would not be exact, or would change nothing (`trainers.checks`).
-
-        Raises:
-            SpecError: what was given, why it cannot work, what to do.
-        """
+        """See `trainers.checks.check`."""
         check(self)
 
 

@@ -1,16 +1,18 @@
 """Credit: from the scored episodes of an update to rows with advantages.
 
-A :class:`CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
+A `CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
 gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
 scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
 became changes nobody's baseline, and all of them share its advantage.
 
 A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
-made after the last step earns nothing in its episode and has no row (:mod:`trainers.sequences`).
+made after the last step earns nothing in its episode and has no row (`trainers.sequences`). What memory writes may
+be credited by estimators of its own, from episodes played beside the batch (`trainers.writes`).
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,8 +20,9 @@ from typing import Any
 
 from agentspec.trajectory import Trajectory
 from rewards import RewardSet, Score
-from trainers.estimators import estimator
+from trainers.estimators import estimator, grpo
 from trainers.sequences import Advantage, Row, TokenSequence, TrainFilter, build_sequences
+from trainers.writes import EVERY, Advantages, Paired, Plan, WriteReturn, WriteRule
 
 Gather = Callable[[list[Any]], list[Any]]
 """List of this rank -> the concatenated lists of all ranks."""
@@ -27,15 +30,23 @@ Gather = Callable[[list[Any]], list[Any]]
 
 @dataclass(frozen=True)
 class ScoredEpisode:
-    """An episode and what it earned; `score` is `None` if it failed."""
+    """An episode and what it earned; `score` is `None` if it failed.
+
+    `beside` are its counterfactuals, each with its plan, where writes are credited by them.
+    """
 
     trajectory: Trajectory
     score: Score | None
+    beside: tuple[tuple[Plan, ScoredEpisode], ...] = ()
 
     @property
     def total(self) -> float | None:
         """The weighted return; `None` if the episode failed."""
         return None if self.score is None else self.score.total
+
+    def rest(self, step: int) -> float | None:
+        """What the episode earned from `step` on; `None` if it failed."""
+        return None if self.score is None else math.fsum(self.score.steps[max(0, step) :])
 
 
 @dataclass(frozen=True)
@@ -46,11 +57,13 @@ class Outcome:
         rewards: per step; `None` if the episode could not be scored.
         anchors: per step the state its action was taken in, if the estimator needs it.
         overlong: whether it ended for one of the reasons that make it overlong.
+        beside: what its counterfactuals earned.
     """
 
     rewards: tuple[float, ...] | None
     anchors: tuple[str, ...] = ()
     overlong: bool = False
+    beside: tuple[WriteReturn, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,19 +76,13 @@ class Credited:
 
 @dataclass(frozen=True)
 class CreditRule:
-    """How episodes are credited.
+    """How episodes are credited; what is not told here is told of the same field of `trainers.config.ScaffoldConfig`.
 
     Args:
         group: rollouts per task; episodes come in whole groups.
-        estimator: a name in `trainers.estimators.ESTIMATORS`.
-        gamma: discount per step, for estimators that need it.
-        gigpo_weight: weight of GiGPO's step advantage.
-        normalize: `token` or `rollout`: whether every trained token weighs alike, or every rollout.
-        overlong: `mask` (no loss, in the baseline), `keep` or `drop` (neither loss nor baseline).
-        overlong_ends: ends that make an episode overlong.
-        skip_zero_variance: leave groups that the estimator gives no signal out of the loss denominator too.
         train: which completions are trained.
         rewards: reward name -> weight.
+        writes: how what memory writes is credited.
     """
 
     group: int
@@ -88,19 +95,16 @@ class CreditRule:
     skip_zero_variance: bool = False
     train: TrainFilter = field(default_factory=TrainFilter)
     rewards: Mapping[str, float] = field(default_factory=lambda: {"earning_delta": 1.0})
-
-    @classmethod
-    def from_config(cls, config: Any) -> CreditRule:
-        """The rule of a :class:`~trainers.config.ScaffoldConfig`."""
-        return cls.from_manifest({name: getattr(config, name) for name in FIELDS})
+    writes: WriteRule = field(default_factory=WriteRule)
 
     @classmethod
     def from_manifest(cls, config: Mapping[str, Any]) -> CreditRule:
-        """The rule of a run, from the configuration that its manifest records.
+        """The rule of a run, from the fields of its configuration (in its manifest, say).
 
         Raises:
             ValueError: the record lacks a field that credit depends on.
         """
+        config = {**OF_OLDER_RUNS, **config}
         missing = [name for name in FIELDS if name not in config]
         if missing:
             raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
@@ -113,6 +117,9 @@ class CreditRule:
                 tuple(config["train_calls"]), tuple(config["train_credits"]), tuple(config["mask_truncated"])
             ),
             rewards=RewardSet({rewards: 1.0} if isinstance(rewards, str) else rewards).weights,
+            writes=WriteRule(
+                config["write_credit"], tuple(config["write_calls"]), config["write_rerolls"], config["write_points"]
+            ),
             **{name: config[name] for name in same},
         )
 
@@ -129,6 +136,7 @@ class CreditRule:
             None if episode.score is None else episode.score.steps,
             tuple(t.input.text for t in trajectory.transitions) if anchors else (),
             is_overlong(trajectory, self.overlong_ends),
+            tuple(WriteReturn(plan, other.rest(plan.step)) for plan, other in episode.beside),
         )
 
     def advantages(self, outcomes: Sequence[Outcome]) -> list[float | list[float] | None]:
@@ -164,7 +172,8 @@ class CreditRule:
         """
         outcomes: list[Outcome] = gather([self.outcome(e) for e in episodes])
         advantages = self.advantages(outcomes)
-        signal = self.signal(advantages)
+        writes = self.write_advantages(outcomes)
+        signal = self.signal(advantages, writes)
         first = rank * len(episodes)
         rows: list[Row] = []
         for i, episode in enumerate(episodes):
@@ -175,15 +184,51 @@ class CreditRule:
             if advantage is None or masked or skipped:
                 continue
             sequences = build_sequences(episode.trajectory, self.train)
-            rows += [Row(s, _per_token(s, advantage), i) for s in sequences]
+            rows += [Row(s, self._per_token(s, advantage, writes[place]), i) for s in sequences]
         if self.normalize == "rollout":
             rows = per_rollout(rows, gather)
-        return Credited(rows, _metrics(outcomes, signal, rows, len(episodes)))
+        metrics = _metrics(outcomes, signal, rows, len(episodes)) | _write_metrics(outcomes, writes)
+        return Credited(rows, metrics)
 
-    def signal(self, advantages: Sequence[float | list[float] | None]) -> list[bool]:
-        """Per group whether its estimator gives anyone an advantage other than 0."""
-        groups = range(0, len(advantages), self.group)
-        return [any(map(_nonzero, advantages[start : start + self.group])) for start in groups]
+    def write_advantages(self, outcomes: Sequence[Outcome]) -> list[Advantages | None]:
+        """Per rollout what its writes earn, by step; `None` where they earn what every other token does."""
+        result: list[Advantages | None] = []
+        for start in range(0, len(outcomes), self.group):
+            members = outcomes[start : start + self.group]
+            group = [Paired(_total(o.rewards or ()) if self._counts(o) else None, o.beside) for o in members]
+            result += self.writes.advantages(group, self._values)
+        return result
+
+    def _values(self, returns: Sequence[float]) -> Sequence[float]:
+        """The run's estimator over one group of returns; `grpo` for those that score steps."""
+        spec = estimator(self.estimator)
+        values: Sequence[float] = grpo(returns) if spec.per_step else spec.function(returns)
+        return values
+
+    def signal(
+        self, advantages: Sequence[float | list[float] | None], writes: Sequence[Advantages | None] = ()
+    ) -> list[bool]:
+        """Per group whether anyone has an advantage other than 0, for what it did or for what it wrote."""
+        groups = [slice(start, start + self.group) for start in range(0, len(advantages), self.group)]
+        return [any(map(_nonzero, advantages[g])) or any(any((w or {}).values()) for w in writes[g]) for g in groups]
+
+    def _per_token(
+        self, sequence: TokenSequence, advantage: float | list[float], writes: Advantages | None
+    ) -> Advantage:
+        """The episode's number or each trained token's step value; tokens of a write earn what the write does."""
+        wrote = {c for c, path in sequence.paths.items() if writes is not None and self.writes.is_write(path)}
+        if isinstance(advantage, float) and not wrote:
+            return advantage
+        values = []
+        for step, call, trained in zip(sequence.steps, sequence.calls, sequence.mask, strict=True):
+            if not trained:
+                values.append(0.0)
+            elif call in wrote:
+                earned = writes or {}
+                values.append(earned.get(step, earned.get(EVERY, 0.0)))
+            else:
+                values.append(advantage if isinstance(advantage, float) else advantage[step])
+        return tuple(values)
 
     def _counts(self, outcome: Outcome) -> bool:
         return outcome.rewards is not None and not (self.overlong == "drop" and outcome.overlong)
@@ -202,8 +247,15 @@ FIELDS = (
     "train_credits",
     "mask_truncated",
     "rewards",
+    "write_credit",
+    "write_calls",
+    "write_rerolls",
+    "write_points",
 )
 """Fields of a configuration that credit depends on."""
+
+OF_OLDER_RUNS = {"write_credit": "episode", "write_calls": ["memory.*"], "write_rerolls": 2, "write_points": 1}
+"""What was so before there were fields for it."""
 
 
 def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
@@ -214,7 +266,7 @@ def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
 
 
 def per_rollout(rows: Sequence[Row], gather: Gather = list) -> list[Row]:
-    """Scale advantages so that every rollout weighs the same, however many tokens its scaffold trained.
+    """Scale advantages so that every rollout has the same weight, however many tokens its scaffold trained.
 
     The loss divides by all N trained tokens; a rollout with n of them counts n / N. With the factor N / (R n), R
     rollouts with something to train, it counts 1 / R: the mean over rollouts of their mean over tokens.
@@ -239,13 +291,6 @@ def _nonzero(advantage: float | list[float] | None) -> bool:
     return any(advantage) if isinstance(advantage, list) else bool(advantage)
 
 
-def _per_token(sequence: TokenSequence, advantage: float | list[float]) -> Advantage:
-    """The episode's number, or each trained token's step value."""
-    if isinstance(advantage, float):
-        return advantage
-    return tuple(advantage[s] if m else 0.0 for s, m in zip(sequence.steps, sequence.mask, strict=True))
-
-
 def _metrics(
     outcomes: Sequence[Outcome], signal: Sequence[bool], rows: Sequence[Row], episodes: int
 ) -> dict[str, float]:
@@ -257,4 +302,18 @@ def _metrics(
         "rollouts/rows_per_episode": len(rows) / max(1, episodes),
         "rollouts/trained_tokens": float(sum(row.sequence.trained for row in rows)),
         "rollouts/multi_row_episodes": sum(n > 1 for n in per_episode.values()) / max(1, episodes),
+    }
+
+
+def _write_metrics(outcomes: Sequence[Outcome], writes: Sequence[Advantages | None]) -> dict[str, float]:
+    """What the writes of the round were worth; nothing where they earn what every other token does."""
+    if all(w is None for w in writes):
+        return {}
+    beside = [r for o in outcomes for r in o.beside]
+    earned = [value for w in writes for value in (w or {}).values()]
+    return {
+        "writes/counterfactuals": float(len(beside)),
+        "writes/failed": sum(r.total is None for r in beside) / max(1, len(beside)),
+        "writes/advantage_mean": math.fsum(earned) / max(1, len(earned)),
+        "writes/with_signal": sum(map(bool, earned)) / max(1, len(earned)),
     }

@@ -1,7 +1,7 @@
 """Expert episodes -> a supervised warm start, in the layout that the policy will meet.
 
 Few tokens of a row are the expert's: a dozen short actions among thousands of tokens of prompts and observations. So
-TRL's ``SFTTrainer`` gets its loss from the packed forward, which computes logits only where a token is trained.
+TRL's `SFTTrainer` gets its loss from the packed forward, which computes logits only where a token is trained.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence, TrainFilter, build_sequences
-from trainers.tree import enable_tree
+from trainers.tree.model import enable_tree
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def demonstrate(
     expert: str = "rule_based",
     make_env: MakeEnv = make_env,
 ) -> Demonstrations:
-    """Play ``tasks`` with the expert, then again inside ``spec`` with the expert's actions as answers.
+    """Play `tasks` with the expert, then again inside `spec` with the expert's actions as answers.
 
     The second pass writes the prompts of the scaffold; the environment is deterministic, so both passes agree.
 
@@ -51,8 +51,7 @@ def demonstrate(
     jobs = [Job(task) for task in tasks]
     scripted = replace(spec, reasoning=ModuleSpec(expert), memory=ModuleSpec("none"), reflection=ModuleSpec("none"))
     played = Runner(scripted, make_env=make_env).run(jobs)
-    names = [f"{job.task.key}-{job.rollout}-{job.seed:x}" for job in jobs]
-    actions = {n: [t.action_text for t in episode.transitions] for n, episode in zip(names, played, strict=True)}
+    actions = {episode.episode: [t.action_text for t in episode.transitions] for episode in played}
     episodes = Runner(spec, DemonstrationLLM(tokenizer, actions), make_env=make_env).run(jobs)
     failed = [t.error for t in (*played, *episodes) if not t.scorable]
     if failed:
@@ -66,7 +65,7 @@ def demonstrate(
 
 
 class DemonstrationTrainer(SFTTrainer):
-    """``SFTTrainer`` whose forward is packed; the loss is the same mean negative log-likelihood of labelled tokens."""
+    """`SFTTrainer` whose forward is packed; the loss is the same mean negative log-likelihood of labelled tokens."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -19,7 +19,6 @@ from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import LLMCall
 from trainers.config import ScaffoldConfig
-from trainers.runlog import paths_called
 from trainers.sequences import TrainFilter, trained_completions
 
 if TYPE_CHECKING:
@@ -98,7 +97,8 @@ def check_trained(episodes: Sequence[Trajectory], train: TrainFilter, gather: Ca
     """
     scored = [t for t in episodes if t.scorable]
     calls = [call for t in scored for call, _ in trained_completions(t, train)]
-    ranks = gather([(bool(scored), bool(calls), paths_called(episodes), {*filter(None, map(_unusable, calls))})])
+    called = {f"{c.tag.path} ({p.credit})" for t in episodes for c in t.calls for p in c.completions}
+    ranks = gather([(bool(scored), bool(calls), called, {*filter(None, map(_unusable, calls))})])
     unusable = set().union(*(bad for *_, bad in ranks))
     if unusable:
         raise SpecError(

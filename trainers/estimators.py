@@ -1,4 +1,4 @@
-"""Estimators: how the returns of a group become advantages. One function and one row of :data:`ESTIMATORS` adds one.
+"""Estimators: how the returns of a group become advantages. One function and one row of `ESTIMATORS` adds one.
 
 An estimator sees the scorable rollouts of one group and nothing else: no failed rollout, no token, no sequence, so
 that none of these can change a baseline. One *per episode* gets their returns and gives one number each; one *per step*
@@ -79,7 +79,7 @@ def rloo(returns: Returns) -> list[float]:
 def max_rl(returns: Returns) -> list[float]:
     """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710).
 
-    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved weighs about
+    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved counts about
     1 / p. A group that earned nothing has no signal.
 
     >>> max_rl([1.0, 0.0, 0.0, 0.0])
@@ -175,7 +175,7 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
 
 
 def estimator(name: str) -> EstimatorSpec:
-    """The row of ``name``.
+    """The row of `name`.
 
     Raises:
         SpecError: no such estimator.

@@ -2,28 +2,28 @@
 
 What training leaves is scattered: weights here or in the last checkpoint, optimiser states beside them, the scaffold in
 the run's manifest. An export holds what is needed to act again and nothing else: the PEFT adapter (or the merged
-model), the tokenizer with its chat template, and ``agentspec.json``, which says what the adapter belongs to and which
+model), the tokenizer with its chat template, and `agentspec.json`, which says what the adapter belongs to and which
 scaffold it was trained in. Weights are safetensors throughout; nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agentspec.files import write_atomic
+from agentspec.files import digest, file_digest, write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
 from agentspec.registry import SpecError
 from agentspec.trajectory import versions
-from trainers.card import model_card
-from trainers.run_folder import checkpoints
+from trainers.card import FILE, model_card
+from trainers.run_folder import MANIFEST as RUN_MANIFEST
+from trainers.run_folder import METRICS, checkpoints
 from trainers.runlog import RunLog
 
 MANIFEST = "agentspec.json"
@@ -52,19 +52,19 @@ class Trained:
 
 
 def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
-    """Write the trained policy of ``run`` to ``to``, whole or not at all.
+    """Write the trained policy of `run` to `to`, whole or not at all.
 
     Args:
         run: output folder of training: its final model, else its last complete checkpoint.
         to: folder to write; must not exist, or be empty.
         merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
-            ``transformers`` reads the result. A run that trained all weights is a whole model either way.
+            `transformers` reads the result. A run that trained all weights is a whole model either way.
 
     Returns:
-        ``to``.
+        `to`.
 
     Raises:
-        SpecError: there are no weights in ``run``, or ``to`` holds something.
+        SpecError: there are no weights in `run`, or `to` holds something.
         ModelNotFoundError: the base model that an adapter needs cannot be found.
     """
     run, to = Path(run), Path(to)
@@ -74,7 +74,8 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
     to.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{to.name}-", dir=to.parent))
     try:
-        base = _base(run, trained)
+        recorded = _recorded(run)
+        base = _base(recorded, trained)
         if trained.adapter and merge:
             _merge(trained.folder, base, work)
         else:
@@ -83,17 +84,17 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
         if base is not None and not merge:
             _name_base(work / ADAPTER_CONFIG, base)
         _tokenizer(trained.folder, base, work)
-        manifest = _manifest(run, trained, base, work, merged=merge and trained.adapter)
-        config = {"model": manifest["base_model"]["name"], "environment": manifest["environment"]}
+        manifest = _manifest(run, recorded, trained, base, work, merged=merge and trained.adapter)
+        config = {**recorded["config"], "model": manifest["base_model"]["name"]}
         card = model_card(
             to.name,
-            {**_recorded(run), **config},
+            config,
             manifest["scaffold"],
             adapter=trained.adapter and not merge,
             note=f"{manifest['kind']}, from the run's {manifest['source']}",
         )
-        write_atomic(work / "README.md", card)
-        manifest["files"] = {path.name: _sha256(path) for path in sorted(work.iterdir())}
+        write_atomic(work / FILE, card)
+        manifest["files"] = {path.name: file_digest(path) for path in sorted(work.iterdir())}
         write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
         _make_readable(work)
         os.replace(work, to)  # onto an empty folder or nothing
@@ -122,26 +123,7 @@ def find_trained(run: Path) -> Trained:
     )
 
 
-def verify(folder: str | Path) -> list[str]:
-    """Files of an export that are missing or differ from its manifest (empty: it is as it was written).
-
-    Raises:
-        SpecError: the folder has no manifest.
-    """
-    folder = Path(folder)
-    if not (folder / MANIFEST).is_file():
-        raise SpecError(f"{folder} has no {MANIFEST}; it was not written by `agentspec export`")
-    recorded = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["files"]
-    problems = []
-    for name, digest in recorded.items():
-        if not (folder / name).is_file():
-            problems.append(f"{name} is missing")
-        elif _sha256(folder / name) != digest:
-            problems.append(f"{name} was changed")
-    return problems
-
-
-def _base(run: Path, trained: Trained) -> ModelSource | None:
+def _base(run: Mapping[str, Any], trained: Trained) -> ModelSource | None:
     """The model an adapter belongs to.
 
     What the adapter itself says counts; the run's configuration knows the name it was asked for by, and stands in when
@@ -149,10 +131,11 @@ def _base(run: Path, trained: Trained) -> ModelSource | None:
     """
     if not trained.adapter:
         return None
-    recorded = json.loads((trained.folder / ADAPTER_CONFIG).read_text(encoding="utf-8")).get("base_model_name_or_path")
+    config = trained.folder / ADAPTER_CONFIG
+    recorded = json.loads(config.read_text(encoding="utf-8")).get("base_model_name_or_path")
     sources: dict[str, str] = {}
     errors: list[ModelNotFoundError] = []
-    for name in (recorded, _configured(run, "model")):
+    for name in (recorded, run["config"].get("model")):
         if name:
             try:
                 sources[name] = resolve(name).path
@@ -162,8 +145,8 @@ def _base(run: Path, trained: Trained) -> ModelSource | None:
         if errors:
             raise errors[0]
         raise ModelNotFoundError(
-            f"neither {run / 'manifest.json'} nor the adapter says which model it was trained on; write its name into "
-            f"base_model_name_or_path of {trained.folder / ADAPTER_CONFIG}"
+            f"neither the run's {RUN_MANIFEST} nor the adapter says which model it was trained on; write its name into "
+            f"base_model_name_or_path of {config}"
         )
     path = next(iter(sources.values()))
     return ModelSource(path, [name for name, found in sources.items() if found == path][-1])
@@ -216,21 +199,25 @@ def _copy(source: Path, to: Path, patterns: Iterable[str]) -> int:
     return len(paths)
 
 
-def _manifest(run: Path, trained: Trained, base: ModelSource | None, work: Path, *, merged: bool) -> dict[str, Any]:
-    source = "final model" if trained.folder == run else trained.folder.name
-    name = base.name if base else _configured(run, "model") or ""
-    recorded = _run_manifest(run)
+def _manifest(
+    run: Path, recorded: Mapping[str, Any], trained: Trained, base: ModelSource | None, work: Path, *, merged: bool
+) -> dict[str, Any]:
+    config, tokenizer = recorded["config"], work / "tokenizer.json"
     return {
         "format": FORMAT,
         "kind": "merged model" if merged else "adapter" if trained.adapter else "model",
-        "source": source,
-        "base_model": {"name": name, "path": base.path if base else "", "revision": _revision(base)},
-        "scaffold": recorded.get("spec") or _configured(run, "agent"),
-        "environment": _configured(run, "environment"),
+        "source": "final model" if trained.folder == run else trained.folder.name,
+        "base_model": {
+            "name": base.name if base else config.get("model") or "",
+            "path": base.path if base else "",
+            "revision": _revision(base),
+        },
+        "scaffold": recorded.get("spec") or config.get("agent"),
+        "environment": config.get("environment"),
         "template_sha256": _template_sha256(work),
-        "tokenizer_sha256": _sha256(work / "tokenizer.json") if (work / "tokenizer.json").is_file() else "",
+        "tokenizer_sha256": file_digest(tokenizer) if tokenizer.is_file() else "",
         "versions": {"export": versions() | _more_versions(), "training": recorded.get("versions", {})},
-        "rewards": reward_summary(RunLog(run).read("metrics.jsonl")),
+        "rewards": reward_summary(RunLog(run).read(METRICS)),
     }
 
 
@@ -238,8 +225,8 @@ def reward_summary(rows: Iterable[dict[str, Any]], *, key: str = "reward", windo
     """The reward curve in a few numbers.
 
     Returns:
-        ``steps`` (last logged step), ``first`` and ``last`` (means of the first and last ``window`` logged values),
-        ``best`` and ``best_step``; empty without a logged reward.
+        `steps` (last logged step), `first` and `last` (means of the first and last `window` logged values),
+        `best` and `best_step`; empty without a logged reward.
     """
     points = [(row["step"], float(row[key])) for row in rows if row.get(key) is not None and "step" in row]
     if not points:
@@ -256,23 +243,11 @@ def reward_summary(rows: Iterable[dict[str, Any]], *, key: str = "reward", windo
     }
 
 
-def _run_manifest(run: Path) -> dict[str, Any]:
-    path = run / "manifest.json"
-    if not path.is_file():
-        return {}
-    data = json.loads(path.read_text(encoding="utf-8"))
-    return data if isinstance(data, dict) else {}
-
-
-def _configured(run: Path, name: str) -> Any:
-    """A setting of the run, from its manifest."""
-    return _run_manifest(run).get(name) or _recorded(run).get(name)
-
-
 def _recorded(run: Path) -> dict[str, Any]:
-    """The run's configuration, as its manifest has it; empty without one."""
-    config = _run_manifest(run).get("config")
-    return config if isinstance(config, dict) else {}
+    """What the run's manifest says, its `config` among it; an empty one without a manifest."""
+    path = run / RUN_MANIFEST
+    data = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return {**data, "config": data.get("config") or {}}
 
 
 def _revision(base: ModelSource | None) -> str:
@@ -295,18 +270,10 @@ def _template_sha256(folder: Path) -> str:
     if not template:
         return ""
     text = template if isinstance(template, str) else json.dumps(template, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return digest(text)
 
 
 def _more_versions() -> dict[str, str]:
     from importlib import metadata
 
     return {name: metadata.version(name) for name in ("peft", "safetensors", "trl")}
-
-
-__all__ = ["MANIFEST", "export", "find_trained", "reward_summary", "verify"]

@@ -1,9 +1,8 @@
 """The lock of a run folder: one run at a time writes into it.
 
-The lock is a file that names its holder: machine, process id and the time at which that process began, so that a
-process that got the same id later is not taken for it. Where the operating system offers record locks (`fcntl`), it
-decides, and a killed run leaves nothing behind that matters. A holder on another machine cannot be asked: it refreshes
-the file's time, and is taken for dead when it has not done so for three minutes.
+The operating system holds the lock (`fcntl`), so that it is gone when its holder is, however that ended. Where that
+says nothing (no such locks here, or a holder on another machine), the file's time does: a holder refreshes it, and is
+taken for dead when it has not done so for three minutes.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import json
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
@@ -22,13 +22,13 @@ from agentspec.registry import SpecError
 
 try:
     import fcntl
-except ImportError:  # no POSIX system: the holder's name decides
+except ImportError:  # no POSIX system
     fcntl = None  # type: ignore[assignment]
 
 LOCK = "run.lock"
 
 BEAT_S, STALE_S = 30.0, 180.0
-"""How often a holder refreshes its lock, and after how long without that a holder elsewhere is taken for dead."""
+"""How often a holder refreshes its lock, and after how long without that it is taken for dead."""
 
 _held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
 _in_process: set[Path] = set()
@@ -63,18 +63,6 @@ def hold(folder: str | Path) -> Iterator[None]:
         _in_process.discard(path)
 
 
-def holder(folder: str | Path) -> dict[str, Any] | None:
-    """Who wrote the folder's lock and is not known to be dead; `None` if nobody."""
-    path = Path(folder).resolve() / LOCK
-    if path in _in_process:
-        return _me()
-    try:
-        named = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return named if isinstance(named, dict) and _may_live(path, named) else None
-
-
 def _acquire(path: Path) -> int:
     """The open lock file, with this process named in it."""
     while True:
@@ -82,7 +70,8 @@ def _acquire(path: Path) -> int:
         try:
             locked = _lock(file)
             named = _named(file)
-            if locked is False or (named and _may_live(path, named, locked=locked is True)):
+            here = named.get("machine") == _me()["machine"]
+            if locked is False or (named and not (locked and here) and _is_fresh(path)):
                 raise _refusal(path, named)
             if not path.exists() or not os.path.samestat(os.fstat(file), path.stat()):
                 os.close(file)  # its holder left, and took the file away, between these lines
@@ -118,61 +107,20 @@ def _named(file: int) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
-def _may_live(path: Path, named: dict[str, Any], locked: bool = False) -> bool:
-    """Whether the process named in a lock file may still be running.
-
-    Args:
-        locked: the operating system gave this process the lock, so that no process of this machine holds it.
-    """
-    me = _me()
-    if named.get("boot") == me["boot"] and me["boot"]:
-        if locked:
-            return False
-        return bool(named.get("started")) and named["started"] == _started(named.get("pid"))
-    if named.get("host") == me["host"]:
-        return False  # the machine has started anew since
+def _is_fresh(path: Path) -> bool:
+    """Whether somebody refreshed the lock of late."""
     try:
-        return _now(path.parent) - path.stat().st_mtime < STALE_S
+        return time.time() - path.stat().st_mtime < STALE_S
     except OSError:
         return False
 
 
 def _me() -> dict[str, Any]:
-    pid = os.getpid()
-    return {"host": socket.gethostname(), "boot": _boot(), "pid": pid, "started": _started(pid)}
-
-
-def _boot() -> str:
-    """Names this start of this machine (the same in all of its containers)."""
+    """This process; `machine` names this start of this machine, the same in all of its containers."""
+    host = machine = socket.gethostname()
     with contextlib.suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="utf-8").strip()
-    return socket.gethostname()
-
-
-def _started(pid: Any) -> str:
-    """When a process of this machine began, in the operating system's own units; empty if there is none."""
-    with contextlib.suppress(OSError, IndexError):
-        # The name, in brackets, may hold spaces; the start is the 22nd field, the 20th after the name.
-        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[19]
-    if Path("/proc/self/stat").exists() or not isinstance(pid, int):
-        return ""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return ""
-    except OSError:
-        pass
-    return "running"
-
-
-def _now(folder: Path) -> float:
-    """The time by the clock that dates the folder's files (that of a file server, say)."""
-    probe = folder / f".clock-{os.getpid()}"
-    probe.touch()
-    try:
-        return probe.stat().st_mtime
-    finally:
-        probe.unlink(missing_ok=True)
+        machine = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="utf-8").strip()
+    return {"host": host, "machine": machine, "pid": os.getpid()}
 
 
 def _beat(path: Path, ended: threading.Event) -> None:

@@ -18,7 +18,8 @@ from agentspec.tokens import shared_prefix
 from trainers.logprobs import sampled_logprobs
 from trainers.micro_batches import padding_row
 from trainers.sequences import Row, TokenSequence
-from trainers.tree import build_tree, packed_inputs, wanted_tokens
+from trainers.tree.model import packed_inputs, wanted_tokens
+from trainers.tree.trie import build_tree
 
 Packing = Literal["tree", "padded"]
 Places = Sequence[tuple[int, int]]
@@ -38,13 +39,13 @@ def rows_logprobs(
 
     Args:
         skip_backward: compute rows without a policy gradient without a graph.
-        packing: `padded` rows, or a prefix `tree` (the model must know it: :func:`trainers.tree.enable_tree`).
+        packing: `padded` rows, or a prefix `tree` (the model must know it: `trainers.tree.model.enable_tree`).
         tokens_per_forward: token budget of a forward (0: no bound for a tree, one row for padded ones). If one forward
             does not hold the micro-batch, forwards are recomputed in the backward pass, so that activations of one
             chunk at a time are kept.
 
     Returns:
-        two float32 tensors of shape (B, L-1), aligned with `completion_ids` of :func:`~trainers.micro_batches.collate`.
+        two float32 tensors of shape (B, L-1), aligned with `completion_ids` of `trainers.micro_batches.collate`.
     """
     trained = [i for i, r in enumerate(rows) if r.sequence.trained]
     still = [i for i in trained if skip_backward and rows[i].zero_gradient]

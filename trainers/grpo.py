@@ -2,7 +2,7 @@
 
 TRL keeps what it is good at: configuration, the clipped losses, PEFT, accelerate, logs, checkpoints. This subclass
 replaces where micro-batches come from: for each generation round it plays one episode per task row, scores it once,
-credits whole groups (:mod:`trainers.credit`), partitions all sequences of all episodes into a fixed number of
+credits whole groups (`trainers.credit`), partitions all sequences of all episodes into a fixed number of
 micro-batches, and counts the denominator over what is trained.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,34 +29,37 @@ from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
 from trainers.card import OwnCards
 from trainers.config import ScaffoldConfig
-from trainers.credit import Credited, CreditRule, ScoredEpisode
+from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
+from trainers.counterfactuals import play_beside
+from trainers.counterfactuals import records as counterfactuals
+from trainers.credit import Credited, ScoredEpisode
 from trainers.distributed import KnownLayout, check_trained
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.losses import UpdateSize, loss
-from trainers.micro_batches import ROWS, collate, padding_row, partition
+from trainers.micro_batches import PADDED, ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
-from trainers.receipts import write_receipt
+from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
-from trainers.rollouts import collect, local_llm, rollout_jobs, starting_states, task_of
+from trainers.rollouts import collect, local_llm, rollout_jobs
 from trainers.round_metrics import episode_metrics, named, round_metrics
-from trainers.run_folder import last_complete_checkpoint
+from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
-from trainers.tree import enable_tree
-from trainers.validation import validate, validation_scaffolds
+from trainers.tree.model import enable_tree
+from trainers.validation import Validation
 from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTrainer):
+class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
-        model: the policy, already loaded (a ``PeftModel`` or any causal LM).
-        args: see :class:`~trainers.config.ScaffoldConfig`.
-        train_dataset: rows of :func:`~trainers.rollouts.task_rows`.
+        model: the policy, already loaded (a `PeftModel` or any causal LM).
+        args: see `trainers.config.ScaffoldConfig`.
+        train_dataset: rows of `trainers.rollouts.task_rows`.
         make_llm: model, tokenizer -> the backend that samples from the live policy (default: the local one).
         make_env: task -> environment.
-        kwargs: passed on to ``trl.GRPOTrainer``.
+        kwargs: passed on to `trl.GRPOTrainer`.
     """
 
     def __init__(
@@ -70,7 +74,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         args.check()
         prepare_vllm(args)
         self.rewards_used = args.reward_set
-        self.credit_rule = CreditRule.from_config(args)
+        self.credit_rule = args.credit_rule
         self._played: list[ScoredEpisode] = []
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
@@ -100,7 +104,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
 
-        ``resume_from_checkpoint=True`` means the last complete checkpoint in ``output_dir``, if there is one.
+        `resume_from_checkpoint=True` means the last complete checkpoint in `output_dir`, if there is one.
         """
         if resume_from_checkpoint is True:
             resume_from_checkpoint = str(last_complete_checkpoint(self.args.output_dir) or "")
@@ -139,10 +143,14 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
             memory=self._memory,
         )
         with self._current_weights():
-            return self._play(jobs)
+            episodes = self._play(jobs)
+            if self.credit_rule.writes.spec.function is None:
+                return episodes
+            runner = replace(self._runner(self.args.spec), progress=None)
+            return play_beside(runner, jobs, episodes, self.credit_rule, retries=self.args.retries)
 
     def _runner(self, spec: AgentSpec) -> Runner:
-        """Runs episodes of ``spec`` with the policy as it is."""
+        """Runs episodes of `spec` with the policy as it is."""
         return Runner(
             spec,
             self.llm,
@@ -154,7 +162,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         )
 
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
-        """One episode per job, in order, those that failed among them; ``spec``: another than the training scaffold."""
+        """One episode per job, in order, those that failed among them; `spec`: another than the training scaffold."""
         runner = self._runner(spec or self.args.spec)
         return collect(runner, jobs, self.rewards_used, retries=self.args.retries)
 
@@ -181,9 +189,9 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         check_trained(self.last_episodes, self.credit_rule.train, gather_object)
 
     def _carried_memory(self) -> bytes | None:
-        """With ``scope: run``: the bank of memories that the next round starts from, the same on every rank.
+        """With `scope: run`: the bank of memories that the next round starts from, the same on every rank.
 
-        Each task carries the memory of one of its own rollouts. The main process keeps the bank as ``memory.json``.
+        Each task carries the memory of one of its own rollouts. The main process keeps the bank as `memory.json`.
         """
         if self.args.spec.scope != "run":
             return None
@@ -228,10 +236,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
+        counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
+        padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []
         for rows in micro_batches:
             batch: dict[str, Any] = collate(rows, self._tokenizer.pad_token_id, device)
-            batch |= {ROWS: rows, "num_items_in_batch": denominator}
+            batch |= {ROWS: rows, "num_items_in_batch": denominator, PADDED: padded}
             if self._off_policy:
                 batch["old_per_token_logps"] = batch["sampled_logprobs"]
             if self.beta != 0.0:
@@ -251,21 +261,24 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
         for name, value in figures.items():
             self._metrics["train"][name].append(value)
         self.run_log.trajectories(self._round, self.accelerator.process_index, episodes)
+        if beside := counterfactuals(self._played):
+            self.run_log.trajectories(self._round, self.accelerator.process_index, beside, COUNTERFACTUALS)
 
     def _log_update(self, rows: Sequence[Row]) -> None:
         """The receipt of a generation round: what every rank contributed, written by the main process."""
-        write_receipt(
-            self.run_log,
-            gather_object,
-            main=self.accelerator.is_main_process,
-            rank=self.accelerator.process_index,
+        rank, played = self.accelerator.process_index, [(e.trajectory.episode, e.total) for e in self._played]
+        padding = [sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS])]
+        files = dict(gather_object(list(self.run_log.written().items())))
+        record = receipt_record(
             round=self._round,
-            played=[(e.trajectory.episode, e.total) for e in self._played],
-            rows=rows,
-            padding_rows=sum(r.episode < 0 for batch in self._buffered_inputs for r in batch[ROWS]),
+            played=gather_object(played),
+            rows=gather_object(receipt_rows(rows, rank * len(played))),
+            padding_rows=sum(gather_object(padding)),
             denominator=int(self._buffered_inputs[0]["num_items_in_batch"]),
-            config=self.args.to_dict(),
+            settings=settings(self.args.to_dict()),
         )
+        if self.accelerator.is_main_process:
+            self.run_log.receipt(record, files)
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
@@ -277,41 +290,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, PolicyLoss, GRPOTr
                 logs["sampling/logp_difference_max"] = torch.tensor(differences).max().item()
         super().log(logs, start_time)
         if self.accelerator.is_main_process and not summary:
-            step, name = self.state.global_step, "metrics.jsonl" if self.model.training else "evaluations.jsonl"
+            step, name = self.state.global_step, METRICS if self.model.training else EVALUATIONS
             if not self.model.training:
                 self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again
             self.run_log.append(name, {"step": step, **logs})
-
-    def evaluate(
-        self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
-    ) -> dict[str, float]:
-        """Play the validation tasks with the policy as it is; see :mod:`trainers.validation`.
-
-        The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
-        had been evaluated.
-
-        Args:
-            eval_dataset: rows of :func:`~trainers.rollouts.task_rows`; default: the trainer's ``eval_dataset``.
-            ignore_keys: not used (part of the base class's signature).
-            metric_key_prefix: stands before every metric's name.
-        """
-        rows = self.eval_dataset if eval_dataset is None else eval_dataset
-        tasks = [task_of(row) for row in rows]
-        states = starting_states(tasks, self._memory, unseen=True)
-        training = self.model.training
-        self.model.eval()
-        with self._current_weights():
-            metrics = validate(
-                validation_scaffolds(self.args),
-                [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
-                lambda spec, jobs: self._play(jobs, spec),
-                rank=self.accelerator.process_index,
-                ranks=self.accelerator.num_processes,
-                gather=gather_object,
-            )
-        metrics = {f"{metric_key_prefix}_{name}": value for name, value in metrics.items()}
-        self.log(dict(metrics))
-        control = self.callback_handler.on_evaluate(self.args, self.state, self.control, metrics)  # type: ignore[has-type]
-        self.control = control
-        self.model.train(training)
-        return metrics

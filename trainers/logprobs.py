@@ -1,6 +1,6 @@
 """Log-probabilities of sampled tokens under the distribution they were sampled from.
 
-A token sampled freely at temperature T has the log-softmax of ``logits / T``; a token sampled under a constraint has
+A token sampled freely at temperature T has the log-softmax of `logits / T`; a token sampled under a constraint has
 the log-softmax over the ids the constraint left. These are the numbers the rollout recorded, so recomputing them with
 unchanged weights gives the same values, and their gradient is the policy gradient of the policy that acted.
 """
@@ -24,7 +24,7 @@ def sampled_logprobs(
         logits: shape (K, V), any float dtype; the reduction is done in float32.
         tokens: shape (K,), the sampled ids.
         temperatures: shape (K,), > 0.
-        allowed: per token the ids its constraint left, or ``None``.
+        allowed: per token the ids its constraint left, or `None`.
 
     Returns:
         log-probabilities (K,) with gradient and entropies (K,) without, both float32, in nats.

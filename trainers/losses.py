@@ -1,7 +1,7 @@
-"""Losses: the objective of a token and what the sum is divided by. One function and one row of :data:`LOSSES` adds one.
+"""Losses: the objective of a token and what the sum is divided by. One function and one row of `LOSSES` adds one.
 
 TRL's losses are TRL's code: such a row names the `loss_type` that computes it. A row of ours brings an `objective`.
-Either way the row says what divides the sum over an update (:class:`UpdateSize`), which tokens it clips, which settings
+Either way the row says what divides the sum over an update (`UpdateSize`), which tokens it clips, which settings
 it reads and how, if at all, it depends on the way episodes split into rows; the trainer, the configuration check, the
 clip shares, the audit and the table in the docs follow from it.
 """
@@ -38,7 +38,7 @@ class UpdateSize:
 
 
 def trained_tokens(size: UpdateSize) -> int:
-    """Every trained token of the update weighs the same."""
+    """Every trained token of the update has the same weight."""
     return size.tokens
 
 
@@ -88,11 +88,12 @@ class LossSpec:
         name: as in `loss_type: NAME`.
         summary: the loss of an update, in one line.
         trl: TRL's `loss_type` whose code computes it; empty where `objective` does.
-        objective: ours: see :data:`Objective`.
+        objective: ours: see `Objective`.
         denominator: what the sum over the update is divided by, where it is one number.
         clipped: which tokens lose their gradient to clipping; arguments as of `objective`.
         uses: settings of the configuration that it reads.
         depends_on_rows: how it depends on the way episodes split into rows; empty if it does not.
+        row_mean: whether it is a mean over rows; padding rows, which TRL would count, are none.
     """
 
     name: str
@@ -103,6 +104,7 @@ class LossSpec:
     clipped: Objective = pushed_outside
     uses: tuple[str, ...] = ("epsilon", "epsilon_high", "delta")
     depends_on_rows: str = ""
+    row_mean: bool = False
 
     @property
     def per_token(self) -> bool:
@@ -139,8 +141,9 @@ LOSSES: dict[str, LossSpec] = {
             "grpo",
             "clipped ratio x advantage: mean over rows of the mean over a row's tokens",
             trl="grpo",
-            depends_on_rows="each row weighs the same, so an episode of three rows weighs three times one of a "
-            "single row",
+            depends_on_rows="each row has the same weight, so an episode of three rows counts three times one of "
+            "a single row",
+            row_mean=True,
         ),
         LossSpec(
             "bnpo",
@@ -155,7 +158,7 @@ LOSSES: dict[str, LossSpec] = {
 
 REFUSED = {
     "luspo": "it sums per row, so an episode counts once per row",
-    "sapo": "it averages per row, so an episode of three rows weighs three times one of a single row",
+    "sapo": "it averages per row, so an episode of three rows counts three times one of a single row",
     "vespo": "its weights are products over one row, not over the episode",
 }
 """TRL's losses that are not offered, and why."""

@@ -17,6 +17,8 @@ from trainers.sequences import Row, TokenSequence
 
 ROWS = "rows"
 """Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
+PADDED = "padded"
+"""Key of the round's number of rows with padding over that without, all ranks together."""
 
 
 def padding_row(token: int) -> Row:

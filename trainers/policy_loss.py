@@ -1,7 +1,7 @@
 """The loss of one micro-batch: log-probabilities of its rows, and the objective that the configuration names.
 
 Mixed into the trainer. TRL computes TRL's losses, from log-probabilities that are given to it here; an objective of
-:mod:`trainers.losses` is computed beside it, with TRL's divergence, importance ratio and figures.
+`trainers.losses` is computed beside it, with TRL's divergence, importance ratio and figures.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trainers.distributed import is_sharded
 from trainers.finite import require_finite
 from trainers.forward import rows_logprobs
 from trainers.losses import divergence
-from trainers.micro_batches import ROWS
+from trainers.micro_batches import PADDED, ROWS
 from trainers.sequences import Row
 from trainers.vllm import importance_ratio
 
@@ -28,7 +28,7 @@ else:
 
 
 class PolicyLoss(Base):
-    """Computes the loss of a micro-batch as of :func:`~trainers.micro_batches.collate`; see the module's docstring."""
+    """Computes the loss of a micro-batch as of `trainers.micro_batches.collate`; see the module's docstring."""
 
     _current: dict[str, Any] | None = None
 
@@ -66,13 +66,15 @@ class PolicyLoss(Base):
         try:
             compute = self._own_loss if self.loss_spec.objective else super()._compute_loss
             value: torch.Tensor = compute(model, inputs)
+            if self.loss_spec.row_mean:  # TRL's mean counts padding rows, whose share depends on the partition
+                value = value * inputs[PADDED]
         finally:
             self._current = None
         require_finite("loss", [(self.args.loss_type, value.detach())], self.state.global_step)
         return value
 
     def _own_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
-        """As TRL computes its losses, with an objective of :mod:`trainers.losses`."""
+        """As TRL computes its losses, with an objective of `trainers.losses`."""
         logps, entropies, _ = self._get_per_token_logps_and_entropies(model)
         mask, old = inputs["tool_mask"], inputs.get("old_per_token_logps", logps.detach())
         per_token = self.loss_spec.objective(logps, old, per_token_advantages(inputs), **self._limits)

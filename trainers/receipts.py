@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
-from trainers.contents import short_digest
-from trainers.credit import FIELDS, Gather
-from trainers.runlog import FORMAT, RunLog
+from trainers.credit import FIELDS
+from trainers.digests import short_digest
+from trainers.runlog import FORMAT
 from trainers.sequences import Row
 
 LOSS_SETTINGS = (
@@ -87,7 +87,7 @@ def receipt_record(
         played: id and return of every episode of the round.
         rows: of all ranks, as of `receipt_rows`.
         padding_rows: rows that fill up micro-batches and train nothing.
-        denominator: what the loss is divided by (:mod:`trainers.losses`).
+        denominator: what the loss is divided by (`trainers.losses`).
         settings: as of `settings`.
     """
     return {
@@ -100,39 +100,3 @@ def receipt_record(
         "denominator": denominator,
         "settings": dict(settings),
     }
-
-
-def write_receipt(
-    log: RunLog,
-    gather: Gather,
-    *,
-    main: bool,
-    rank: int,
-    round: int,
-    played: Sequence[tuple[str, float | None]],
-    rows: Sequence[Row],
-    padding_rows: int,
-    denominator: int,
-    config: Mapping[str, Any],
-) -> None:
-    """Gather what every rank contributed to a round; the main process appends the receipt.
-
-    Args:
-        gather: list of this rank -> concatenated lists of all ranks.
-        played: id and return of this rank's episodes.
-        rows: of this rank.
-        padding_rows: of this rank.
-        config: the run's configuration as plain data.
-    """
-    files, everyone = dict(gather(list(log.written().items()))), gather(list(played))
-    all_rows, padding = gather(receipt_rows(rows, rank * len(played))), sum(gather([padding_rows]))
-    if main:
-        record = receipt_record(
-            round=round,
-            played=everyone,
-            rows=all_rows,
-            padding_rows=padding,
-            denominator=denominator,
-            settings=settings(config),
-        )
-        log.receipt(record, files)

@@ -43,10 +43,10 @@ class ScaffoldState:
     """Position and buffers of a run at a checkpoint.
 
     Args:
-        step: micro-batches done (TRL's ``_step``).
+        step: micro-batches done (TRL's `_step`).
         round: number of the generation round that filled the buffer.
         buffered: micro-batches of the round, each a list of rows; empty at a round's end.
-        memory: state of a memory with ``scope: run``.
+        memory: state of a memory with `scope: run`.
     """
 
     step: int
@@ -73,7 +73,7 @@ def unmark(folder: str | Path) -> None:
 
 
 def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None:
-    """The result of a run whose checkpoint is its last one, with the weights loaded; ``None`` if steps are left.
+    """The result of a run whose checkpoint is its last one, with the weights loaded; `None` if steps are left.
 
     The training loop would take one step too many: it looks at the step count only after a step.
 
@@ -96,7 +96,7 @@ def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None
 
 
 def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:
-    """The state in a checkpoint folder; ``None`` if it holds none (a checkpoint of stock TRL).
+    """The state in a checkpoint folder; `None` if it holds none (a checkpoint of stock TRL).
 
     Raises:
         ValueError: a file of another format.
@@ -151,7 +151,7 @@ def rows_of(batches: Sequence[dict[str, Any]] | None) -> tuple[tuple[Row, ...], 
 
 
 class ExactResume(Base):
-    """What a trainer saves and loads beyond TRL's; mixed into :class:`~trainers.grpo.ScaffoldGRPOTrainer`."""
+    """What a trainer saves and loads beyond TRL's; mixed into `trainers.grpo.ScaffoldGRPOTrainer`."""
 
     def _save_checkpoint(self, model: nn.Module, trial: Any) -> None:
         """As TRL's; the main process's state is written last, and older checkpoints go only after that."""

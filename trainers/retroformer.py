@@ -6,11 +6,11 @@ of a task, k lessons about it, and k further trials, each played with one of the
 
 1. each task of the round is played once, from an empty memory;
 2. if that trial failed, k episodes start from the memory it left. Each begins by writing its own lesson
-   (``when: start``) and is paid ``G(this trial) - G(failed trial)`` (reward ``reflection_gain``);
+   (`when: start`) and is paid `G(this trial) - G(failed trial)` (reward `reflection_gain`);
 3. if it did not fail, there is nothing to learn: the trial stands in for the k episodes, without rows or gradient.
 
-The actor is greedy (``actor_temperature: 0``), so that what changes between trials is owed to the lesson; a lesson is
-sampled at the agent's temperature. Everything else is :class:`~trainers.grpo.ScaffoldGRPOTrainer`. The paper trains its
+The actor is greedy (`actor_temperature: 0`), so that what changes between trials is owed to the lesson; a lesson is
+sampled at the agent's temperature. Everything else is `trainers.grpo.ScaffoldGRPOTrainer`. The paper trains its
 reflector with a reward model and PPO on stored lessons; here the group is the baseline, and lessons are always fresh.
 """
 
@@ -35,17 +35,20 @@ from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
-from trainers.rollouts import collect
+from trainers.rollouts import collect, local_llm
 from trainers.sequences import TrainFilter
+
+ADAPTERS = {PATH: TRAINED, "*": ACTOR}
+"""Which adapter answers: lessons come from the trained one, everything else from the actor's."""
 
 FIRST_TRIALS = "first_trials"
 """Folder of a run that holds the trials that were reflected on, one file per generation round."""
 
 
 def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
-    """Make ``config`` train the reflector, and nothing else.
+    """Make `config` train the reflector, and nothing else.
 
-    The agent's reflection becomes ``retroformer`` with ``when: start`` and its scope ``run``; the lessons are the
+    The agent's reflection becomes `retroformer` with `when: start` and its scope `run`; the lessons are the
     trained calls; the reward, unless one is given, is the change of return.
 
     Raises:
@@ -69,10 +72,10 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
     """GRPO for the reflector of a frozen actor.
 
     Args:
-        model: a PEFT model as of :func:`~trainers.policy.load_actor_and_reflector`.
-        args: as of :func:`as_retroformer`.
+        model: a PEFT model as of `trainers.policy.load_actor_and_reflector`.
+        args: as of `as_retroformer`.
         make_llm: model, tokenizer -> a backend that gives each call its adapter.
-        kwargs: as of :class:`~trainers.grpo.ScaffoldGRPOTrainer`.
+        kwargs: as of `trainers.grpo.ScaffoldGRPOTrainer`.
     """
 
     def __init__(
@@ -84,7 +87,8 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         **kwargs: Any,
     ) -> None:
         check_retroformer(args)
-        super().__init__(model, args, make_llm=make_llm or partial(routed_llm, batching=args.batching), **kwargs)
+        llm = partial(local_llm, batching=args.batching, adapters=ADAPTERS)
+        super().__init__(model, args, make_llm=make_llm or llm, **kwargs)
         self._first_trials: list[ScoredEpisode] = []
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: Any = None) -> None:
@@ -163,15 +167,8 @@ def has_lesson(trajectory: Trajectory) -> bool:
 
 
 def acting_scaffold(config: ScaffoldConfig) -> AgentSpec:
-    """The scaffold with the actor at ``actor_temperature`` and lessons at the agent's own temperature."""
+    """The scaffold with the actor at `actor_temperature` and lessons at the agent's own temperature."""
     spec = config.spec
     params = {"temperature": spec.sampling.temperature, **spec.reflection.params}
     sampling = replace(spec.sampling, temperature=config.actor_temperature)
     return replace(spec, reflection=ModuleSpec(spec.reflection.name, params), sampling=sampling)
-
-
-def routed_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
-    """The local backend: lessons come from the trained adapter, everything else from the actor's."""
-    from agentspec.llm.local import LocalLLM
-
-    return LocalLLM(model, tokenizer, name="policy", adapters={PATH: TRAINED, "*": ACTOR}, batching=batching)

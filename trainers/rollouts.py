@@ -1,7 +1,7 @@
 """G rollouts of each task, run through the agent, all at once.
 
-The trainer hands over its generation batch (task rows, each repeated G times by TRL's sampler); what comes back is one
-:class:`~trainers.credit.ScoredEpisode` per row, in order: the trajectory and what it earned, computed once. A rollout
+The trainer gives its generation batch (task rows, each repeated G times by TRL's sampler); what comes back is one
+`trainers.credit.ScoredEpisode` per row, in order: the trajectory and what it earned, computed once. A rollout
 that failed is among them, without a score.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -19,13 +19,10 @@ from agentspec.carry import MemoryBank
 from agentspec.episode import Job, Runner
 from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
-from agentspec.tasks import TEST_SEEDS, make_tasks
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from rewards import RewardSet, Score
 from trainers.credit import ScoredEpisode
-
-__all__ = ["TEST_SEEDS", "collect", "make_tasks", "rollout_jobs", "starting_states", "task_of", "task_rows"]
 
 
 def task_rows(tasks: Sequence[Task]) -> list[dict[str, Any]]:
@@ -58,7 +55,7 @@ def rollout_jobs(
         round: number of the generation round; another round samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
-        memory: the run's `agentspec.carry.MemoryBank` as bytes (with ``scope: run``): all rollouts of a task start
+        memory: the run's `agentspec.carry.MemoryBank` as bytes (with `scope: run`): all rollouts of a task start
             from that task's state.
     """
     run_seed = derive_seed(seed, round)
@@ -74,7 +71,7 @@ def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool
 
     Args:
         tasks: in order.
-        memory: a `MemoryBank` as bytes; ``None``: nothing is carried.
+        memory: a `MemoryBank` as bytes; `None`: nothing is carried.
         unseen: tasks that the run does not train on: without a state of their own they start from the latest.
     """
     if memory is None:
@@ -117,8 +114,10 @@ def _scored(trajectory: Trajectory, rewards: RewardSet) -> ScoredEpisode:
     return ScoredEpisode(trajectory, score)
 
 
-def local_llm(model: nn.Module, tokenizer: Any, batching: Any = "auto") -> LLM:
-    """The local backend over the live policy."""
+def local_llm(
+    model: nn.Module, tokenizer: Any, batching: Any = "auto", adapters: Mapping[str, str] | None = None
+) -> LLM:
+    """The local backend over the live policy; `adapters`: which of its adapters answers which calls."""
     from agentspec.llm.local import LocalLLM
 
-    return LocalLLM(model, tokenizer, name="policy", batching=batching)
+    return LocalLLM(model, tokenizer, name="policy", batching=batching, adapters=adapters)

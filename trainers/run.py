@@ -12,13 +12,14 @@ from typing import Any
 from datasets import Dataset
 from transformers import PrinterCallback, ProgressCallback
 
+from agentspec.tasks import make_tasks
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
 from trainers.folder_lock import hold
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.report import Bar, TerminalReport
-from trainers.rollouts import make_tasks, task_rows
+from trainers.rollouts import task_rows
 from trainers.run_folder import last_complete_checkpoint
 
 
@@ -52,10 +53,30 @@ def train(
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None
     model, tokenizer = load(config)
+    trainer = _trainer(trainer_class, config, model, tokenizer, callbacks)
+    main = trainer.accelerator.is_main_process
+    for line in (*(f"note: {n}" for n in notes(config)), *([f"resuming from {last}"] if last else [])):
+        if main:
+            print(line, file=sys.stderr)
+    with hold(folder) if main else nullcontext():  # until the final model is saved
+        try:
+            trainer.train(resume_from_checkpoint=str(last) if last else None)
+        except KeyboardInterrupt:
+            if main:
+                print(f"\n{_how_to_continue(folder)}", file=sys.stderr)
+            raise
+        trainer.save_model(str(folder))
+    return trainer
+
+
+def _trainer(
+    kind: type[ScaffoldGRPOTrainer], config: ScaffoldConfig, model: Any, tokenizer: Any, callbacks: Sequence[Any]
+) -> ScaffoldGRPOTrainer:
+    """The trainer, with its tasks and with our reports in the place of the libraries'."""
     name, options = config.world
     tasks = make_tasks(name, options, config.train_tasks)
     held_out = make_tasks(name, options, config.validation_tasks, split="validation") if config.validates else []
-    trainer = trainer_class(
+    trainer = kind(
         model,
         config,
         train_dataset=Dataset.from_list(task_rows(tasks)),
@@ -67,18 +88,6 @@ def train(
         trainer.add_callback(Bar)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(TerminalReport(lambda: trainer.last_episodes))
-    say = print if trainer.accelerator.is_main_process else _silent
-    for note in notes(config):
-        say(f"note: {note}", file=sys.stderr)
-    if last:
-        say(f"resuming from {last}", file=sys.stderr)
-    with hold(folder) if trainer.accelerator.is_main_process else nullcontext():  # until the final model is saved
-        try:
-            trainer.train(resume_from_checkpoint=str(last) if last else None)
-        except KeyboardInterrupt:
-            say(f"\n{_how_to_continue(folder)}", file=sys.stderr)
-            raise
-        trainer.save_model(str(folder))
     return trainer
 
 
@@ -87,7 +96,3 @@ def _how_to_continue(folder: Path) -> str:
     if last is None:
         return "stopped before the first checkpoint; the same command starts anew (`save_steps` says when one is made)"
     return f"stopped; the same command with `--resume` continues from {last}"
-
-
-def _silent(*_: Any, **__: Any) -> None:
-    """What other processes than the main one say."""

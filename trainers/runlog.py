@@ -10,8 +10,8 @@
         seal.json                 written when the run ends: its digest is the head of the chain
 
 A receipt holds the digests of its round's trajectory files, of the manifest and of the receipt before it; the seal
-holds those of the last receipt and of all logged lines. Whoever keeps the head can tell any later edit. Without it, an
-edit is told as long as its author does not compute every digest after it anew.
+holds those of the last receipt and of all logged lines, and how many bytes these files have. Whoever keeps the head can
+tell any later edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from agentspec.files import (
     write_atomic,
 )
 from agentspec.trajectory import Trajectory, versions
-from trainers.contents import contents, field_digests
+from trainers.digests import field_digests
 from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
 
-FORMAT = 2
+FORMAT = 3
 LOGGED = (METRICS, EVALUATIONS)
 """Files that the seal covers line by line."""
 
@@ -48,7 +48,6 @@ class RunLog:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._written: dict[str, dict[str, Any]] = {}
-        self._read: dict[Path, tuple[tuple[int, int], str]] = {}
 
     def manifest(self, **fields: Any) -> None:
         """Write `manifest.json`: what was run, with which versions and command. One that is there is kept beside it."""
@@ -79,10 +78,10 @@ class RunLog:
         lines = [episode.to_json() for episode in episodes]
         blob = "".join(line + "\n" for line in lines)
         write_atomic(self.folder / name, blob)
-        self._written[name] = {"digest": digest(blob), "episodes": [contents(json.loads(line)) for line in lines]}
+        self._written[name] = {"digest": digest(blob), "episodes": [field_digests(json.loads(line)) for line in lines]}
 
     def written(self) -> dict[str, dict[str, Any]]:
-        """File -> its `digest` and that of each of its `episodes` by class of field, since this was last asked."""
+        """File -> its `digest` and that of each of its `episodes` by field, since this was last asked."""
         written, self._written = self._written, {}
         return written
 
@@ -94,19 +93,8 @@ class RunLog:
 
     def receipt(self, record: Mapping[str, Any], files: Mapping[str, Any]) -> None:
         """Append a receipt, chained to the one before it, the manifest and its round's files (as of `written`)."""
-        chain = {"manifest": self._digest(MANIFEST), "files": dict(files), "previous": last_digest(self.folder)}
+        chain = {"manifest": manifest_digest(self.folder), "files": dict(files), "previous": last_digest(self.folder)}
         append_lines(self.folder / UPDATES, {**record, "chain": chain})
-
-    def _digest(self, name: str) -> str:
-        """Digest of a file, read again only if it was written since."""
-        path = self.folder / name
-        if not path.is_file():
-            return ""
-        stat = path.stat()
-        known = self._read.get(path)
-        if known is None or known[0] != (stat.st_mtime_ns, stat.st_ino):
-            known = self._read[path] = ((stat.st_mtime_ns, stat.st_ino), file_digest(path))
-        return known[1]
 
     def seal(self) -> str:
         """End the chain; returns its head, the digest of the seal."""
@@ -155,18 +143,20 @@ def last_digest(folder: Path) -> str:
     return digest(last) if last else ""
 
 
+def manifest_digest(folder: Path) -> str:
+    """Digest of the manifest; empty if there is none."""
+    return file_digest(folder / MANIFEST) if (folder / MANIFEST).is_file() else ""
+
+
 def seal_of(folder: Path) -> dict[str, Any]:
     """What a run's seal must hold."""
     logs = {name: [digest(line)[:16] for _, line in whole_lines(folder / name)] for name in LOGGED}
+    sizes = {name: (folder / name).stat().st_size for name in (UPDATES, *LOGGED) if (folder / name).is_file()}
     return {
         "format": FORMAT,
         "updates": sum(1 for _ in whole_lines(folder / UPDATES)),
         "last_receipt": last_digest(folder),
-        "manifest": file_digest(folder / MANIFEST) if (folder / MANIFEST).is_file() else "",
+        "manifest": manifest_digest(folder),
         "logs": {name: lines for name, lines in logs.items() if lines},
+        "sizes": sizes,
     }
-
-
-def paths_called(trajectories: Sequence[Trajectory]) -> set[str]:
-    """`module/purpose (credit)` of everything that the episodes asked the model."""
-    return {f"{c.tag.path} ({p.credit})" for t in trajectories for c in t.calls for p in c.completions}

@@ -24,7 +24,7 @@ class TrainFilter:
     """Which completions are trained.
 
     Args:
-        patterns: shell patterns over ``module/purpose`` paths; a pattern without ``/`` matches any purpose.
+        patterns: shell patterns over `module/purpose` paths; a pattern without `/` matches any purpose.
         credits: credits that are trained.
         mask_truncated: patterns of calls whose completions are context only when they hit their length limit (a
             summary cut off in the middle, say).
@@ -35,11 +35,11 @@ class TrainFilter:
     mask_truncated: tuple[str, ...] = ()
 
     def matches(self, path: str) -> bool:
-        """Whether calls of ``path`` may be trained."""
+        """Whether calls of `path` may be trained."""
         return matches(path, self.patterns)
 
     def completions(self, call: LLMCall) -> list[Completion]:
-        """The trained completions of ``call``."""
+        """The trained completions of `call`."""
         if not self.matches(call.tag.path):
             return []
         cut = matches(call.tag.path, self.mask_truncated)
@@ -54,9 +54,9 @@ class TrainFilter:
 class TokenSequence:
     """One training row.
 
-    All lists have one entry per token. ``logprobs`` are those of the sampling distribution (0 where ``mask`` is 0),
-    ``temperatures`` the sampling temperature, ``calls`` the id of the call that wrote the token (-1: nobody's choice).
-    ``allowed`` maps a position to the ids its constraint left, ``paths`` a call's id to its ``module/purpose``.
+    All lists have one entry per token. `logprobs` are those of the sampling distribution (0 where `mask` is 0),
+    `temperatures` the sampling temperature, `calls` the id of the call that wrote the token (-1: nobody's choice).
+    `allowed` maps a position to the ids its constraint left, `paths` a call's id to its `module/purpose`.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -87,7 +87,7 @@ class TokenSequence:
         self.steps += [-1] * n
 
     def extend_sampled(self, call: LLMCall, completion: Completion) -> None:
-        """Append a ``completion`` of ``call``; tokens that were a choice are trained.
+        """Append a `completion` of `call`; tokens that were a choice are trained.
 
         Raises:
             ValueError: the backend recorded no log-probabilities for it.
@@ -158,12 +158,12 @@ def trained_completions(trajectory: Trajectory, train: TrainFilter) -> list[tupl
 
 
 def _extendable(rows: list[TokenSequence], prompt: SequenceOf[int]) -> TokenSequence | None:
-    """The longest row that ``prompt`` begins with."""
+    """The longest row that `prompt` begins with."""
     prompt = list(prompt)
     fitting = [r for r in rows if len(r) <= len(prompt) and prompt[: len(r)] == r.tokens]
     return max(fitting, key=len, default=None)
 
 
 def unmatched_patterns(paths: SequenceOf[str], train: TrainFilter) -> list[str]:
-    """Patterns of ``train`` that match none of the call ``paths`` an agent can make."""
+    """Patterns of `train` that match none of the call `paths` an agent can make."""
     return [p for p in train.patterns if not any(TrainFilter((p,)).matches(path) for path in paths)]

@@ -1,8 +1,8 @@
 """SUPO (arXiv 2510.06727) as a configuration: GRPO with a summary schedule, trained summaries and overlong masking.
 
-There is no second trainer. Summaries come from :mod:`agentspec.memory.summary`; each segment between two of them is a
-row (:mod:`trainers.sequences`), the advantage belongs to the rollout (:mod:`trainers.credit`), and an episode that
-ran out of context gets zero loss while it stays in the baseline (``overlong: mask``). This module checks that a
+There is no second trainer. Summaries come from `agentspec.memory.summary`; each segment between two of them is a
+row (`trainers.sequences`), the advantage belongs to the rollout (`trainers.credit`), and an episode that
+ran out of context gets zero loss while it stays in the baseline (`overlong: mask`). This module checks that a
 configuration is SUPO and fills in what follows from it.
 """
 
@@ -17,9 +17,9 @@ PATTERN = f"memory.{MEMORY}"
 
 
 def as_supo(config: ScaffoldConfig, *, every: int = 8) -> ScaffoldConfig:
-    """Make ``config`` train with periodic summaries.
+    """Make `config` train with periodic summaries.
 
-    The agent's memory becomes ``summary`` (every ``every`` actions) unless it is already, summaries join the trained
+    The agent's memory becomes `summary` (every `every` actions) unless it is already, summaries join the trained
     calls, and summaries that hit their length limit are context only.
 
     Raises:

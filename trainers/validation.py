@@ -9,17 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from accelerate.utils import gather_object
 
 from agentspec.episode import Job
 from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
+from trainers.rollouts import starting_states, task_of
+
+if TYPE_CHECKING:
+    from trl import GRPOTrainer as Base
+else:
+    Base = object
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:
-    """Scaffold by prefix of its metrics: the training scaffold has none, others ``LABEL/``; greedy by default."""
+    """Scaffold by prefix of its metrics: the training scaffold has none, others `LABEL/`; greedy by default."""
     training = config.spec
     scaffolds = {"": training} | {f"{s.label}/": s for s in config.other_specs if s != training}
     changes = config.evaluation_sampling
@@ -38,15 +46,15 @@ def validate(
     """Mean figures per scaffold over the same tasks.
 
     Args:
-        scaffolds: by prefix, as of :func:`validation_scaffolds`.
+        scaffolds: by prefix, as of `validation_scaffolds`.
         jobs: all of them; rank r plays those at r, r + ranks, ...
         play: scaffold, jobs -> episodes, scored by the training reward.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Returns:
-        ``PREFIXreward`` (the training reward per episode), the figures that the environment declares and the scaffold's
-        (`agentspec.metrics.figures`), and ``PREFIXunscorable``, the share of episodes that failed; means leave these
-        out. ``reward`` is NaN if all failed.
+        `PREFIXreward` (the training reward per episode), the figures that the environment declares and the scaffold's
+        (`agentspec.metrics.figures`), and `PREFIXunscorable`, the share of episodes that failed; means leave these
+        out. `reward` is NaN if all failed.
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
@@ -68,3 +76,41 @@ def _figures(episode: ScoredEpisode) -> dict[str, float] | None:
 
 def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values) if values else math.nan
+
+
+class Validation(Base):
+    """Evaluates by playing; mixed into the trainer."""
+
+    def evaluate(
+        self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
+    ) -> dict[str, float]:
+        """Play the validation tasks with the policy as it is.
+
+        The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
+        had been evaluated.
+
+        Args:
+            eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
+            ignore_keys: not used (part of the base class's signature).
+            metric_key_prefix: stands before every metric's name.
+        """
+        rows = self.eval_dataset if eval_dataset is None else eval_dataset
+        tasks = [task_of(row) for row in rows]
+        states = starting_states(tasks, self._memory, unseen=True)
+        training = self.model.training
+        self.model.eval()
+        with self._current_weights():
+            metrics = validate(
+                validation_scaffolds(self.args),
+                [Job(t, 0, self.args.seed, s) for t, s in zip(tasks, states, strict=True)],
+                lambda spec, jobs: self._play(jobs, spec),
+                rank=self.accelerator.process_index,
+                ranks=self.accelerator.num_processes,
+                gather=gather_object,
+            )
+        metrics = {f"{metric_key_prefix}_{name}": value for name, value in metrics.items()}
+        self.log(dict(metrics))
+        control = self.callback_handler.on_evaluate(self.args, self.state, self.control, metrics)  # type: ignore[has-type]
+        self.control = control
+        self.model.train(training)
+        return metrics

@@ -1,8 +1,8 @@
 """Rounds with vLLM: the policy's weights go in before it samples, and what its kernels do otherwise is corrected.
 
-TRL's ``VLLMGeneration`` owns the engine: it merges the adapter, gathers what is sharded and pushes the weights. It also
-puts the engine to sleep between its own calls of ``generate``; a scaffold asks many times a round, so here a whole
-round is one stretch awake. The engine itself is spoken to by :mod:`agentspec.llm.vllm`.
+TRL's `VLLMGeneration` owns the engine: it merges the adapter, gathers what is sharded and pushes the weights. It also
+puts the engine to sleep between its own calls of `generate`; a scaffold asks many times a round, so here a whole
+round is one stretch awake. The engine itself is spoken to by `agentspec.llm.vllm`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def vllm_round(generation: Any, *, stale: bool) -> Iterator[None]:
     """The engine holds the policy's weights and is awake inside this block.
 
     Args:
-        generation: TRL's ``VLLMGeneration``.
+        generation: TRL's `VLLMGeneration`.
         stale: whether the weights changed since they were pushed last. Every rank must say the same: gathering sharded
             weights takes all of them.
     """
@@ -110,8 +110,8 @@ def importance_ratio(
 ) -> torch.Tensor:
     """Weight of each token for having been sampled by vLLM's kernels and not by the trainer's.
 
-    ``exp(logps - sampled)``, clipped to ``low .. high`` (``token_truncate``) or 0 outside (``token_mask``); 1 where
-    ``mask`` is 0. Truncated importance sampling, token by token, as TRL's.
+    `exp(logps - sampled)`, clipped to `low .. high` (`token_truncate`) or 0 outside (`token_mask`); 1 where
+    `mask` is 0. Truncated importance sampling, token by token, as TRL's.
 
     Args:
         logps, sampled, mask: (B, T): recomputed and recorded log-probabilities, and which tokens are trained.

@@ -1,13 +1,16 @@
-"""`agentspec view`: a recorded episode, readable."""
+"""`agentspec view`: a recorded episode, or what a carried memory holds, readable."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import textwrap
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from agentspec.files import write_atomic
+from agentspec.memory_text import data, diff, read_bank, text
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Transition
@@ -17,16 +20,32 @@ WIDTH = 116
 
 def add_parser(commands: Any) -> None:
     """Arguments of `agentspec view`."""
-    parser = commands.add_parser("view", help="print a recorded episode", description="Print a recorded episode.")
-    parser.add_argument("file", metavar="TRAJ.jsonl", help="trajectories, one JSON line each")
+    parser = commands.add_parser(
+        "view",
+        help="print a recorded episode, or a memory",
+        description="Print a recorded episode, or (--memory) what a memory file holds.",
+    )
+    parser.add_argument("file", metavar="TRAJ.jsonl", nargs="?", help="trajectories, one JSON line each")
     parser.add_argument("--episode", type=int, default=0, metavar="N", help="which of them, from 0")
     parser.add_argument("--steps", default="", metavar="A-B", help="only these steps")
     parser.add_argument("--full", action="store_true", help="observations and every model call as well")
+    parser.add_argument("--memory", metavar="FILE", help="a memory file, or a run folder that holds one")
+    parser.add_argument("--diff", metavar="FILE", help="with --memory: what another one holds in its place")
+    parser.add_argument("--task", default="", metavar="KEY", help="with --memory: only this task")
+    parser.add_argument("--json", action="store_true", help="with --memory: the states as JSON")
+    parser.add_argument("--to", metavar="FILE", help="with --memory: write there instead of printing")
     parser.set_defaults(command=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print one episode."""
+    """Print one episode, or a memory."""
+    if arguments.memory is not None:
+        return _memory(arguments)
+    if arguments.file is None:
+        raise SpecError("give a file of trajectories, or --memory with a memory file")
+    given = [n for n in ("diff", "task", "json", "to") if getattr(arguments, n)]
+    if given:
+        raise SpecError(f"--{given[0]} goes with --memory")
     trajectory = _nth(Path(arguments.file), arguments.episode)
     wanted = _range(arguments.steps)
     print("\n".join(header(trajectory)))
@@ -34,6 +53,27 @@ def run(arguments: argparse.Namespace) -> int:
         if transition.step in wanted:
             print("\n".join(step_lines(trajectory, transition, full=arguments.full)))
     print("\n".join(footer(trajectory)))
+    return 0
+
+
+def _memory(arguments: argparse.Namespace) -> int:
+    """A memory file as text or JSON, or the difference of two."""
+    if arguments.file is not None:
+        raise SpecError(f"give trajectories ({arguments.file}) or --memory, not both")
+    if arguments.diff and arguments.json:
+        raise SpecError("--diff prints text; leave out --json")
+    bank = read_bank(arguments.memory)
+    if arguments.json:
+        shown = json.dumps(data(bank, arguments.task), indent=2, ensure_ascii=False)
+    elif arguments.diff:
+        shown = "\n".join(diff(bank, read_bank(arguments.diff), arguments.task))
+    else:
+        shown = "\n".join(text(bank, arguments.task))
+    if arguments.to:
+        write_atomic(Path(arguments.to), shown + "\n")
+        print(f"{arguments.memory} -> {arguments.to}")
+    else:
+        print(shown)
     return 0
 
 

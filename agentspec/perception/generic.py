@@ -26,6 +26,7 @@ class GenericPerception:
     declaration = Declaration(
         "image, instruction, state and action schema of any environment that keeps the contract",
         waived={"images": ("images", False)},
+        aliases=("deliverybench",),  # its name in specs of earlier versions
     )
 
     def __init__(self, images: bool = False) -> None:

@@ -36,10 +36,10 @@ from agentspec.prompting import (
     static_prompt,
     user_turn,
 )
-from agentspec.reading import visible
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
 from agentspec.types import AgentInput, Decision, LLMCall, Recall, Task, Transition
+from agentspec.visible import visible
 
 PRESETS = {
     "paper": {"persistent": False, "think": True, "plan_tokens": 512},

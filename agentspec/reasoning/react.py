@@ -28,10 +28,11 @@ from agentspec.prompting import (
     static_prompt,
     user_turn,
 )
-from agentspec.reading import read, visible
+from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
 from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
+from agentspec.visible import visible
 
 FORMAT = (
     "Work in turns. Write what you think in one or two sentences after 'Thought:', then one line "

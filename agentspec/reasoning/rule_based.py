@@ -39,7 +39,7 @@ class RuleBased(Stateless):
 
     declaration = Declaration(
         "the environment's scripted expert: no model, a baseline and demonstrator",
-        envs=("deliverybench", "minigrid"),
+        scripted=True,
         aliases=("simple",),
     )
 
@@ -78,11 +78,11 @@ class RuleBased(Stateless):
 
 
 class RandomLegal(Stateless):
-    """A random one of the actions that make sense now: of the menu where there is one, else the environment's own."""
+    """A random action: of the menu where there is one, else of the environment's own player, else of the examples."""
 
     declaration = Declaration(
         "a random sensible action: no model, the floor",
-        envs=("deliverybench", "minigrid"),
+        scripted=True,
         name="random",
     )
 
@@ -102,9 +102,12 @@ class RandomLegal(Stateless):
         schema = input.action_schema
         if schema.choices:
             return decision(self.services.rng.choice(schema.choices), input, "random")
-        if self.player is None:
-            raise ValueError("random: this environment offers neither a menu nor a random player; use menu mode")
-        return decision(self.player.act({"state": input.state, "action_schema": schema}), input, "random")
+        if self.player is not None:
+            return decision(self.player.act({"state": input.state, "action_schema": schema}), input, "random")
+        examples = [action.example for action in schema.actions.values() if action.example]
+        if not examples:
+            raise ValueError("random: this environment offers no menu, no random player and no examples of its actions")
+        return decision(self.services.rng.choice(examples), input, "random")
 
     def snapshot(self) -> bytes:
         """The state of the generator."""

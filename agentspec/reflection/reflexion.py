@@ -95,9 +95,7 @@ class Reflexion:
         learns = bool(trajectory.transitions) and failed(trajectory, log.best, self.threshold, self.max_repeats)
         call = None
         try:
-            if learns and self.control:
-                self._learn(log, log.trials, self.control)
-            elif learns:
+            if learns:
                 call = await self._ask(trajectory, log)
         finally:  # the trial counts, whether or not the budget allowed a lesson
             log.best = total if log.best is None else max(log.best, total)
@@ -111,6 +109,9 @@ class Reflexion:
         return trial_prompt(trajectory, log, self.max_reflections, REFLECT, self.trial_tokens, self.services)
 
     async def _ask(self, trajectory: Trajectory, log: TrialLog) -> LLMCall | None:
+        if self.control:
+            self._learn(log, log.trials, self.control)
+            return None
         answer = await self.services.ask("reflect", self._prompt(trajectory, log), self.reflection_tokens)
         if answer.value:
             self._learn(log, log.trials, answer.value)

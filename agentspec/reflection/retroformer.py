@@ -6,9 +6,8 @@ is paid the change of return it brought, `G(next trial) - G(this trial)`.
 
 *As it comes the reflector is untrained*: it is the policy's own weights, and the module measures what training needs.
 The call that writes a lesson is tagged `reflection.retroformer/reflect` and credited as executed; its reward is known
-one trial later and is recorded in *that* trial's metrics (`reflection/reward` and whose call it pays).
-`reflection_samples` joins the two. Samples of one `group` reflect on the same failed trial and are each
-followed by a trial of their own, so their rewards compare like with like.
+one trial later and is recorded in *that* trial's metrics (`reflection/reward`, and by `reflection/episode` and
+`reflection/call` whom it pays).
 
 `when` says in which of the two trials the lesson is written: at the `end` of the failed one, or at the `start` of
 the next. What the reflector reads is the same. With `start` a lesson and the trial that pays it are one episode, so
@@ -23,8 +22,6 @@ episode.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -33,12 +30,12 @@ from agentspec.llm.base import ContextOverflowError, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.parameters import one_of
 from agentspec.protocols import Services
-from agentspec.reading import visible
 from agentspec.reflection.reflexion import Reflexion
 from agentspec.reflection.trials import TrialLog, episode_return
 from agentspec.state import dump_state, load_state
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, LLMCall, Recall, Task
+from agentspec.visible import visible
 
 PATH = "reflection.retroformer/reflect"
 WHEN = ("end", "start")
@@ -56,27 +53,13 @@ class Due:
 
 @dataclass(frozen=True)
 class Pending:
-    """A lesson whose worth is not known yet: which call of which trial wrote it, and that trial's return."""
+    """A lesson whose worth is not known yet: which call of which trial wrote it (-1: none, it is the `control`), and
+    that trial's return."""
 
     episode: str
     trial: int
     call: int
     before: float
-
-
-@dataclass(frozen=True)
-class ReflectionSample:
-    """One training example of the reflector.
-
-    Args:
-        group: name of the prompt: samples of one group reflect on the same failed trial.
-        call: the call that wrote the lesson.
-        reward: change of return from the trial reflected on to the next.
-    """
-
-    group: str
-    call: LLMCall
-    reward: float
 
 
 class Retroformer(Reflexion):
@@ -159,8 +142,15 @@ class Retroformer(Reflexion):
             return None
         return await self._write(log, due)
 
-    async def _write(self, log: TrialLog, due: Due) -> LLMCall:
-        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other."""
+    async def _write(self, log: TrialLog, due: Due) -> LLMCall | None:
+        """Ask for the lesson. An empty answer is no lesson, but a choice that is paid like any other.
+
+        A `control` takes its place at the same time and is paid the same way, so that trials compare like with like.
+        """
+        if self.control:
+            self._pending[self._key] = Pending("", due.trial, -1, due.before)
+            self._learn(log, due.trial, self.control)
+            return None
         sampling = {} if self.temperature is None else {"temperature": self.temperature}
         messages = (system(due.instruction), user(due.request))
         call = await self.services.llm.generate("reflect", messages, max_tokens=self.reflection_tokens, **sampling)
@@ -184,21 +174,3 @@ class Retroformer(Reflexion):
         super().restore(dump_state(logs))
         self._due = {key: Due(**d) for key, d in due.items()}
         self._pending = {key: Pending(**p) for key, p in pending.items()}
-
-
-def reflection_samples(trajectories: Iterable[Trajectory]) -> list[ReflectionSample]:
-    """The reflector's training examples in a stream of trials, in the order their rewards became known.
-
-    Args:
-        trajectories: trials in the order they were played; a lesson whose trial is not among them is left out.
-    """
-    written: dict[tuple[str, int], LLMCall] = {}
-    samples = []
-    for trajectory in trajectories:
-        written |= {(trajectory.episode, c.id): c for c in trajectory.calls if c.tag.path == PATH}
-        paid = trajectory.metrics
-        call = written.get((str(paid.get("reflection/episode")), int(paid.get("reflection/call", -1))))
-        if call is not None:
-            group = hashlib.sha256(repr(call.prompt_ids).encode()).hexdigest()[:12]
-            samples.append(ReflectionSample(group, call, float(paid["reflection/reward"])))
-    return samples

@@ -24,10 +24,10 @@ from agentspec.llm.base import Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.parameters import at_least, settings
 from agentspec.prompting import CALL_ANSWER, MENU_ANSWER, ON_REQUEST, clip, read_call, static_prompt, user_turn
-from agentspec.reading import visible
 from agentspec.services import Services
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task
+from agentspec.visible import visible
 
 PRESETS = {"paper": {"max_iterations": 3, "feedback_tokens": 384}, "rl": {"max_iterations": 1, "feedback_tokens": 128}}
 

@@ -16,10 +16,11 @@ from typing import Any
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.base import describe
 from agentspec.prompting import clip, static_prompt
-from agentspec.reading import read, visible
+from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, Recall, RecallItem, Task, Transition
+from agentspec.visible import visible
 
 KEYS = ("task", "family")
 

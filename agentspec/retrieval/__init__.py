@@ -11,7 +11,7 @@ All are deterministic, hold nothing outside the process and belong to one memory
 from agentspec.retrieval.fusion import min_max, mmr, reciprocal_rank_fusion, weighted_fusion
 from agentspec.retrieval.graph import Graph, ego_split, label_propagation, replica_graph
 from agentspec.retrieval.lexical import Lexical
-from agentspec.retrieval.vector import VectorIndex
+from agentspec.retrieval.vector import VectorIndex, top_rows
 
 __all__ = [
     "Graph",
@@ -23,5 +23,6 @@ __all__ = [
     "mmr",
     "reciprocal_rank_fusion",
     "replica_graph",
+    "top_rows",
     "weighted_fusion",
 ]

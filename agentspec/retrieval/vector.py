@@ -17,6 +17,18 @@ from agentspec.protocols import Embedder
 _FIRST_CAPACITY = 16
 
 
+def top_rows(scores: NDArray[Any], k: int) -> NDArray[np.intp]:
+    """Rows of the `k` greatest scores, best first; of equals the first ones.
+
+    >>> top_rows(np.array([1.0, 3.0, 2.0, 3.0]), 3).tolist()
+    [1, 3, 2]
+    """
+    rows = np.arange(len(scores))
+    if 0 < k < len(scores):  # only what may be among the first k is sorted
+        rows = np.flatnonzero(scores >= np.partition(scores, len(scores) - k)[len(scores) - k])
+    return np.asarray(rows[np.argsort(-scores[rows], kind="stable")][: max(0, k)], dtype=np.intp)
+
+
 class VectorIndex:
     """Keys (ints) with a text and its vector each.
 

@@ -80,7 +80,7 @@ def cases(kinds: tuple[str, ...] = KINDS) -> list[Case]:
     found = []
     for kind in kinds:
         for name, entry in REGISTRY.all(kind).items():
-            if not entry.envs and entry.target.startswith("agentspec."):
+            if not entry.scripted and entry.target.startswith("agentspec."):
                 found += variants(kind, name, entry)
     return found
 

@@ -44,7 +44,7 @@ def test_modules_are_left_out_only_for_their_environment() -> None:
     covered = {(c.kind, c.name) for c in cases()}
     for kind in KINDS:
         for name, entry in REGISTRY.all(kind).items():
-            assert (kind, name) in covered or entry.envs
+            assert (kind, name) in covered or entry.scripted
 
 
 @both_modes

@@ -10,6 +10,8 @@ import pytest
 
 from agentspec.envs import check_environment, make_env
 from agentspec.envs.contract import INFO_KEYS
+from agentspec.episode import Job, Runner
+from agentspec.spec import AgentSpec
 from agentspec.types import Task
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "own_environment.md"
@@ -25,6 +27,8 @@ def test_the_example_keeps_the_contract(tmp_path: Path, monkeypatch: pytest.Monk
         env.reset(seed=0)
         paid = [env.step("RIGHT()")[1] for _ in range(4)]
         assert sum(paid) == 1.0  # from cell 0, 1 or 2 the end is at most three steps away, and is paid once
+        (played,) = Runner(AgentSpec.from_data({"reasoning": "random"})).run([Job(Task("corridor:Corridor-v0"))])
+        assert played.scorable and played.metrics["invalid_actions"] == 0
     finally:
         sys.modules.pop("corridor", None)
 

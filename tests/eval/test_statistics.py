@@ -131,6 +131,25 @@ def test_runs_without_any_spread():
     assert compare_runs(same, [{0: 0.0}]).p == 0.0
 
 
+def test_runs_that_are_equal_up_to_float_noise_are_a_tie() -> None:
+    # 0.1 + 0.2 is 0.3 + 5.6e-17; no run differs from another of its side.
+    noisy, plain = [{0: 0.1 + 0.2}] * 3, [{0: 0.3}] * 3
+    assert compare_runs(noisy, plain).tie() and compare_runs(noisy, plain[:1]).tie()
+    assert compare_runs([*noisy[:1], *plain[:2]], plain[:1]).tie()
+
+
+def test_runs_without_a_common_task_show_nothing() -> None:
+    for b in ([{1: 1.0}], [{1: 1.0}] * 3):
+        found = compare_runs([{0: 2.0}] * 3, b)
+        assert found.n == 0 and math.isnan(found.mean) and math.isnan(found.p) and found.tie()
+
+
+def test_a_run_with_a_value_that_is_no_number_is_refused() -> None:
+    for b in ([{0: 1.0}], [{0: 1.0}] * 3):
+        with pytest.raises(ValueError, match="finite"):
+            compare_runs([{0: math.nan}] * 3, b)
+
+
 def test_holm_steps_down():
     # sorted .01 .03 .04: 3 * .01, 2 * .03, max(.06, .04); NaN does not count
     assert holm([0.04, math.nan, 0.01, 0.03]) == pytest.approx([0.06, math.nan, 0.03, 0.06], nan_ok=True)

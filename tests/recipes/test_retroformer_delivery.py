@@ -15,7 +15,7 @@ pytest.importorskip("peft")
 from safetensors.torch import load_file
 
 from recipes.common import CONFIGS
-from recipes.retroformer_delivery import main, markdown
+from recipes.retroformer_delivery import CONTROL, main, markdown
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
 from trainers.arguments import parse_config
@@ -59,14 +59,19 @@ def test_from_nothing_to_the_table(
     assert any(w.any() for n, w in reflector.items() if "lora_B" in n)  # these start at zero
     assert not any(w.any() for n, w in actor.items() if "lora_B" in n)
     assert [v for r in audit(folder) for v in r.violations] == []
-    # The evaluation: the same tasks and the same first trials for both reflectors.
+    # The evaluation: the same tasks and the same first trials for both reflectors and for the meaningless lesson.
     rows = [json.loads(line) for line in (folder / "evaluation.jsonl").read_text().splitlines()]
-    before, after = rows[:3], rows[3:]
-    assert [r["seed"] for r in before] == [r["seed"] for r in after] == [20_000, 20_001, 20_002]
+    control, before, after = rows[:3], rows[3:6], rows[6:]
+    assert [r["seed"] for r in control] == [r["seed"] for r in before] == [r["seed"] for r in after]
+    assert [r["seed"] for r in before] == [20_000, 20_001, 20_002]
+    assert [r["first_return"] for r in control] == [r["first_return"] for r in before]
     assert [r["first_return"] for r in before] == [r["first_return"] for r in after]
+    # A threshold of 99 fails every trial: each is played again with the same words.
+    assert [r["lesson"] for r in control] == [CONTROL] * 3 and all(r["lesson"] != CONTROL for r in rows[3:])
     table = (folder / "evaluation.md").read_text()
     assert table == markdown(rows) and table in capsys.readouterr().out
-    assert "before training" in table and "after training less before training" in table
+    for a, b in (("before", "meaningless lesson"), ("after", "meaningless lesson"), ("after", "before training")):
+        assert f"Paired difference in gain, {a} training less {b}: " in table
 
 
 def row(reflector: str, task: str, first: float | None, second: float | None, lesson: str = "x") -> dict:

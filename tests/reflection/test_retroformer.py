@@ -6,13 +6,12 @@ import pytest
 
 from agentspec.episode import Job, Runner
 from agentspec.llm.scripted import ScriptedLLM
-from agentspec.reflection.retroformer import PATH, Retroformer, reflection_samples
+from agentspec.reflection.retroformer import PATH, Retroformer
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, read_trajectories, write_trajectories
 from agentspec.types import Task
 from tests.reasoning.numbers_env import NUMBERS
 from tests.reflection.test_reflexion import SPEC, learner, module, run, trial
-from trainers.estimators import grpo
 from trainers.sequences import TrainFilter, build_sequences
 
 RETRO = {**SPEC, "reflection": "retroformer"}
@@ -57,14 +56,14 @@ def test_a_success_pays_and_writes_no_lesson() -> None:
     assert len(recorder.calls) == 2 and retro.metrics() == {}
 
 
-def test_samples_join_prompt_and_reward_across_trials(tmp_path) -> None:
+def test_the_trial_that_pays_says_whose_call_it_pays(tmp_path) -> None:
     played = chain(learner, 2)
     assert played[1].metrics["reflection/reward"] == 1.0 and "reflection/reward" not in played[0].metrics
     write_trajectories(tmp_path / "t.jsonl", played)
     for stream in (played, list(read_trajectories(tmp_path / "t.jsonl"))):
-        (sample,) = reflection_samples(stream)
-        assert sample.reward == 1.0 and sample.call == stream[0].calls[-1] and sample.call.tag.path == PATH
-    assert reflection_samples(played[1:]) == []  # its trial is not among them
+        paid, lesson = stream[1].metrics, stream[0].calls[-1]
+        assert (paid["reflection/episode"], paid["reflection/call"]) == (stream[0].episode, lesson.id)
+        assert lesson.tag.path == PATH
 
 
 def test_the_reflector_is_trained_and_the_actor_is_not() -> None:
@@ -98,21 +97,3 @@ def test_gradients_reach_the_reflectors_adapter_only() -> None:
     for name, parameter in model.named_parameters():
         moved = parameter.grad is not None and bool(parameter.grad.abs().sum() > 0)
         assert moved == (".reflector." in name and "lora_B" in name), name
-
-
-def test_rewards_of_one_failed_trial_are_normalised_against_each_other() -> None:
-    # Four lessons about the same trial, followed by trials that change the return by 1, 0, 0 and -1.
-
-    changes = [1.0, 0.0, 0.0, -1.0]
-    samples = []
-    for i, change in enumerate(changes):
-        first = chain(lambda r, i=i: f"lesson {i}" if r.tag.purpose == "reflect" else learner(r), 1)[0]
-        metrics = {
-            "reflection/episode": first.episode,
-            "reflection/call": first.calls[-1].id,
-            "reflection/reward": change,
-        }
-        samples += reflection_samples([first, trial(0.0, **metrics)])
-    assert len({s.group for s in samples}) == 1 and len({s.call.text for s in samples}) == 4
-    advantages = grpo([s.reward for s in samples])
-    assert abs(sum(advantages)) < 1e-6 and advantages[0] > 0 > advantages[3]

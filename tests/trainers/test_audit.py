@@ -23,8 +23,8 @@ from tests.toy_env import ToyEnv
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import UpdateAudit, _check_advantages, _check_samples, audit, padding_rows
-from trainers.contents import contents, differing
 from trainers.credit import CreditRule
+from trainers.digests import differing, field_digests
 from trainers.estimators import ESTIMATORS
 from trainers.provenance import check_completion, check_tokens
 from trainers.receipts import row_digest
@@ -128,26 +128,26 @@ def test_a_run_with_failed_rollouts_passes_and_counts_them(tmp_path: Path) -> No
 # --- edits -----------------------------------------------------------------------------------------------------------
 
 NAMED = {
-    "log-probabilities of all sampled tokens": "trajectories/000001.jsonl, record 1 .*: edited: log-probabilities",
-    "log-probability of a forced token": "record 1 .*: edited: log-probabilities",
-    "temperature of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
-    "top_p of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
-    "top_k of a trained call": r"record 1 .*: edited: sampling \(temperature, top_p, top_k\)",
-    "constraint widened": "record 1 .*: edited: constraints",
+    "log-probabilities of all sampled tokens": r"000001.jsonl, record 1 .*: edited: calls.completions.logprobs",
+    "log-probability of a forced token": "record 1 .*: edited: calls.completions.logprobs",
+    "temperature of a trained call": r"record 1 .*: edited: calls.sampling",
+    "top_p of a trained call": r"record 1 .*: edited: calls.sampling",
+    "top_k of a trained call": r"record 1 .*: edited: calls.sampling",
+    "constraint widened": "record 1 .*: edited: calls.completions.allowed",
     "constraint without the sampled token": "its constraint does not hold token",
-    "constraint lifted": "record 1 .*: edited: constraints",
-    "sampled token": "record 1 .*: edited: tokens",
-    "action text": "record 1 .*: edited: actions",
-    "observation text": "record 1 .*: edited: observations",
-    "completion text": "record 1 .*: edited: completion texts",
-    "finish reason": "record 1 .*: edited: finish reasons",
-    "credit of a completion": "record 1 .*: edited: credits",
-    "spec of an episode": "record 1 .*: edited: spec",
-    "versions of an episode": "record 1 .*: edited: versions",
+    "constraint lifted": "record 1 .*: edited: calls.completions.allowed",
+    "sampled token": "record 1 .*: edited: calls.completions.token_ids",
+    "action text": "record 1 .*: edited: steps.action",
+    "observation text": "record 1 .*: edited: steps.text",
+    "completion text": "record 1 .*: edited: calls.completions.text",
+    "finish reason": "record 1 .*: edited: calls.completions.finish_reason",
+    "credit of a completion": "record 1 .*: edited: calls.completions.credit",
+    "spec of an episode": "record 1 .*: edited: spec.",
+    "versions of an episode": "record 1 .*: edited: versions.",
     "policy of an episode": "not played by policy step-1",
-    "status of an episode": "record 1 .*: edited: identity",
-    "reward of a step": "record 1 .*: edited: rewards",
-    "the same added to all returns of a group": "record 2 .*: edited: metrics, rewards",
+    "status of an episode": "record 1 .*: edited: status",
+    "reward of a step": "record 1 .*: edited: steps.reward",
+    "the same added to all returns of a group": "record 2 .*: edited: metrics.return, steps.info, steps.reward",
     "an episode deleted": "has 3 records, the receipt names 4",
     "episodes reordered": r"episodes\[0\] is .* but the receipt says",
     "the first update deleted": r"record 1 was not the first: .*deleted",
@@ -177,6 +177,12 @@ NAMED = {
     "a trajectory file deleted": "trajectories/000000.jsonl is missing",
     "a trajectory file added": "trajectories/000900.jsonl: no receipt names it",
     "bytes that read the same": "trajectories/000001.jsonl or its digest .*; its records read as before",
+    "a trajectory file of another name added": "trajectories/more.jsonl: no receipt names it",
+    **{
+        f"a {what} line in {name}": rf"{name} has \d+ bytes, seal.json says \d+ \(`sizes`\)"
+        for what in ("torn", "blank")
+        for name in ("updates.jsonl", "metrics.jsonl", "evaluations.jsonl")
+    },
 }
 
 
@@ -210,7 +216,7 @@ def test_an_editor_who_computes_every_digest_anew_is_told_by_the_head_alone(copy
     def rechain(records: list[dict[str, Any]]) -> None:
         stated = records[1]["chain"]["files"]["trajectories/000001.jsonl"]
         stated["digest"] = file_digest(path)
-        stated["episodes"] = [contents(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+        stated["episodes"] = [field_digests(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         line = json.dumps(records[1], sort_keys=True, ensure_ascii=False) + "\n"
         records[2]["chain"]["previous"] = digest(line)
 
@@ -317,13 +323,19 @@ def test_the_digest_reads_tokens_mask_and_advantage() -> None:
     assert known == row_digest([1, 2], [0, 1], 0.5 + 1e-12)
 
 
-def test_every_field_of_an_episode_has_one_class() -> None:
-    record = json.loads(episode([call(0, [1], [5])], rewards=(1.0,)).to_json())
-    before = contents(record)
-    assert "other fields" not in before
-    assert differing(before, contents({**record, "new": 1})) == ["other fields"]
-    record["calls"][0]["completions"][0]["later"] = 1
-    assert differing(before, contents(record)) == ["other fields"]
+def test_every_field_of_an_episode_has_a_digest() -> None:
+    record = json.loads(episode([call(0, [1], [5]), call(1, [1], [6])], rewards=(1.0,)).to_json())
+    before = field_digests(record)
+    assert differing(before, field_digests({**record, "new": 1})) == ["new"]
+    assert differing(before, field_digests({**record, "task": {**record["task"], "x": 1}})) == ["task.x"]
+    assert differing(before, field_digests({**record, "calls": record["calls"][:1]}))[0] == "calls"
+    # A value that moves from one call to another is an edit too.
+    first, second = (c["completions"][0] for c in record["calls"])
+    first["later"] = 1
+    known = field_digests(record)
+    assert differing(before, known) == ["calls.completions.later"]
+    second["later"] = first.pop("later")
+    assert differing(known, field_digests(record)) == ["calls.completions.later"]
     assert differing(None, before) == sorted(before)
 
 
@@ -352,7 +364,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path, capsys: pytest.Ca
 
 def test_a_receipt_of_another_version_is_told(copy: Path) -> None:
     edit(copy / "updates.jsonl", lambda r: [record.pop("chain") and record.pop("format") for record in r] and None)
-    assert any("has format None, expected 2" in v for v in violations(copy))
+    assert any("has format None, expected 3" in v for v in violations(copy))
 
 
 def test_a_line_that_is_being_written_is_left_alone(copy: Path) -> None:

@@ -14,7 +14,7 @@ pytest.importorskip("peft")
 from agentspec.spec import AgentSpec
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.card import base_name, model_card
-from trainers.export import export, verify
+from trainers.export import export
 
 
 def head(text: str) -> dict:
@@ -53,4 +53,3 @@ def test_runs_checkpoints_and_exports_have_it(tmp_path: Path) -> None:
         assert head(text)["tags"] == ["agentspec"] and "trained inside an agent's scaffold" in text
         assert str(tmp_path) not in text and "Framework versions" not in text
     assert "README.md" in json.loads((tmp_path / "out" / "agentspec.json").read_text())["files"]
-    assert verify(tmp_path / "out") == []

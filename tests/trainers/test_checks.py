@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import runpy
 from dataclasses import fields
 from pathlib import Path
@@ -18,7 +19,7 @@ from trl import GRPOConfig
 
 from agentspec.registry import SpecError
 from trainers.arguments import parse_config
-from trainers.checks import check_given, check_reporters
+from trainers.checks import check_given, check_reporters, notes
 from trainers.config import ScaffoldConfig
 from trainers.fields import FIXED, REFUSED, USED, field_rules
 
@@ -136,3 +137,57 @@ def test_where_logs_go_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
         check_reporters(Reporting())
     Reporting.report_to = ["wandb"]
     check_reporters(Reporting())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"reference": "base"},
+        {"loss_type": "cispo", "epsilon": 0.9, "epsilon_high": 5.0},
+        {"memory_carry": "best"},
+        {"actor_adapter": "somewhere"},
+        {"actor_temperature": 0.7},
+        {"lora_r": 0, "lora_layers": 2},
+        {"lora_r": 0, "lora_targets": ["q_proj"]},
+        {"lora_r": 0, "lora_alpha": 32},
+        {"mask_truncated": ["memory.nothing"]},
+        {"validation_specs": [{"reasoning": "cot"}]},
+    ],
+    ids=str,
+)
+def test_a_setting_that_nobody_would_read_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(SpecError, match=next(reversed(changes)) if "epsilon" not in changes else "epsilon"):
+        config(tmp_path, **changes).check()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"estimator": "reward_to_go", "gamma": 1.5},
+        {"estimator": "reward_to_go", "gamma": -1.0},
+        {"estimator": "gigpo", "gigpo_weight": math.nan},
+        {"epsilon": -0.2},
+        {"beta": -1.0},
+        {"top_entropy_quantile": 2.0},
+        {"learning_rate": -1.0},
+        {"loss_type": "dr_grpo", "max_completion_length": -5},
+        {"num_iterations": 0},
+        {"tokens_per_forward": -1},
+        {"lora_layers": -1},
+    ],
+    ids=str,
+)
+def test_a_number_out_of_its_range_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(SpecError, match=f"{next(reversed(changes))} is .*; expected a number of at least"):
+        config(tmp_path, **changes).check()
+
+
+def test_a_weight_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    """It would make every return NaN, and every advantage 0."""
+    with pytest.raises(SpecError, match="reward 'env' has weight nan"):
+        config(tmp_path, rewards={"env": math.nan}).check()
+
+
+def test_a_cap_below_1_is_told(tmp_path: Path) -> None:
+    told = [n for n in notes(config(tmp_path, loss_type="cispo")) if "epsilon_high 0.2" in n]
+    assert len(told) == 1 and not notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0))

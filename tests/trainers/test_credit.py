@@ -16,6 +16,7 @@ from tests.trainers.builders import call, episode
 from trainers.config import ScaffoldConfig
 from trainers.credit import FIELDS, Credited, CreditRule, Outcome
 from trainers.sequences import TrainFilter
+from trainers.writes import WriteRule
 
 
 def credited(episodes: list[Trajectory], **rule: Any) -> Credited:
@@ -41,8 +42,12 @@ def test_one_rule_from_a_configuration_and_from_its_record(tmp_path: Path) -> No
         train_credits=["aux"],
         mask_truncated=["memory.summary"],
         rewards={"env": 2.0},
+        write_credit="local",
+        write_calls=["memory.summary"],
+        write_rerolls=3,
+        write_points=2,
     )
-    rule = CreditRule.from_config(given)
+    rule = given.credit_rule
     assert rule == CreditRule.from_manifest(given.to_dict())
     assert rule == CreditRule(
         2,
@@ -55,10 +60,12 @@ def test_one_rule_from_a_configuration_and_from_its_record(tmp_path: Path) -> No
         True,
         TrainFilter(("memory.*",), ("aux",), ("memory.summary",)),
         {"env": 2.0},
+        WriteRule("local", ("memory.summary",), 3, 2),
     )
     # Every value above differs from the default, so no field can be forgotten on the way.
-    plain = CreditRule.from_config(config(tmp_path))
+    plain = config(tmp_path).credit_rule
     assert all(getattr(plain, f.name) != getattr(rule, f.name) for f in fields(CreditRule) if f.name != "group")
+    assert all(getattr(plain.writes, f.name) != getattr(rule.writes, f.name) for f in fields(WriteRule))
     with pytest.raises(ValueError, match="lacks normalize"):
         CreditRule.from_manifest({n: v for n, v in given.to_dict().items() if n in FIELDS and n != "normalize"})
 

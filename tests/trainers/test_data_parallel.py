@@ -52,6 +52,8 @@ CASES: dict[str, dict[str, Any]] = {
     # The second task pays everybody alike: the process that holds its group has nothing to learn.
     "idle": {"num_generations": 4, "max_steps": 1, "shuffle_dataset": False},
     "failed": {"num_generations": 8},
+    # A mean over rows: the process with fewer of them has more padding.
+    "rows": {"num_generations": 8, "loss_type": "grpo"},
     "kl": {"num_generations": 8, "beta": 0.1},
     "played": {"num_generations": 8},
     # The second round starts from lessons that the best rollout of the first wrote, on whichever process it was.

@@ -14,10 +14,11 @@ pytest.importorskip("peft")
 from peft import LoraConfig, PeftModel, get_peft_model
 from transformers import AutoModelForCausalLM, AutoTokenizer
 
+from agentspec.files import file_digest
 from agentspec.llm.models import ModelNotFoundError
 from agentspec.registry import SpecError
 from tests.tiny import tiny_model, tiny_tokenizer
-from trainers.export import MANIFEST, export, find_trained, reward_summary, verify
+from trainers.export import MANIFEST, export, find_trained, reward_summary
 from trainers.runlog import RunLog
 
 TEXT = "go to pickup of order 3"
@@ -90,10 +91,8 @@ def test_the_manifest_says_what_it_is(tmp_path: Path, base: Path) -> None:
     assert manifest["rewards"] == {"steps": 4, "first": 3.0, "last": 3.0, "best": 6.0, "best_step": 3}
     assert {"adapter_model.safetensors", "tokenizer.json"} <= set(manifest["files"])
     assert manifest["versions"]["export"]["peft"]
-    assert verify(tmp_path / "out") == []
-    (tmp_path / "out" / "tokenizer.json").write_text("{}")
-    (tmp_path / "out" / "adapter_model.safetensors").unlink()
-    assert verify(tmp_path / "out") == ["adapter_model.safetensors is missing", "tokenizer.json was changed"]
+    written = {p.name: file_digest(p) for p in (tmp_path / "out").iterdir() if p.name != MANIFEST}
+    assert manifest["files"] == written
 
 
 def test_the_last_complete_checkpoint_stands_in_for_the_final_model(tmp_path: Path, base: Path) -> None:

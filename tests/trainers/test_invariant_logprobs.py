@@ -22,7 +22,7 @@ from trainers.forward import rows_logprobs
 from trainers.micro_batches import collate
 from trainers.policy import load_policy
 from trainers.sequences import Row, build_sequences
-from trainers.tree import enable_tree
+from trainers.tree.model import enable_tree
 
 WORLD = {"size": "tiny", "observation": "compact", "shift_hours": 0.3, "max_steps": 2}
 

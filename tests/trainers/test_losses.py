@@ -30,13 +30,11 @@ def logs(*values: float) -> torch.Tensor:
 
 
 def test_what_each_loss_divides_by() -> None:
-    assert {name: spec.denominator(SIZE) for name, spec in LOSSES.items() if not spec.depends_on_rows} == {
-        "dapo": 30,
-        "cispo": 30,
-        "dr_grpo": 800,  # 8 rollouts x 100, whatever was sampled
-        "dppo": 30,
-    }
-    assert [name for name, spec in LOSSES.items() if spec.per_token] == ["dapo", "cispo", "dppo"]
+    ours = {"dapo": 30, "cispo": 30, "dppo": 30, "dr_grpo": 800}  # 8 rollouts x 100, whatever was sampled
+    assert {name: LOSSES[name].denominator(SIZE) for name in ours} == ours
+    per_token = {name: spec.per_token for name, spec in LOSSES.items()}
+    assert {name: per_token[name] for name in ours} == {"dapo": True, "cispo": True, "dppo": True, "dr_grpo": False}
+    assert not per_token["grpo"] and not per_token["bnpo"]  # they depend on rows
 
 
 def test_what_is_clipped() -> None:

@@ -17,7 +17,7 @@ from datasets import Dataset
 from peft import LoraConfig, get_peft_model
 
 from agentspec.episode import Job
-from agentspec.reflection.retroformer import PATH, reflection_samples
+from agentspec.reflection.retroformer import PATH
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Task
@@ -148,8 +148,8 @@ def test_a_group_reflects_on_one_failed_trial(trained: Any) -> None:
             prompt = tiny_tokenizer().decode(trajectory.calls[1].prompt_ids)
             assert not text or f"Trial 0: {text}" in prompt
         assert len({c.text for t in episodes[:4] for c in t.calls if c.tag.path == PATH}) > 1
-        groups = [s.group for s in reflection_samples(episodes)]
-        assert len(groups) == 8 and len(set(groups)) == 2
+        lessons = [c for t in episodes for c in t.calls if c.tag.path == PATH]
+        assert len(lessons) == 8 and len({c.prompt_ids for c in lessons}) == 2  # two failed trials, four lessons each
 
 
 def test_the_audit_is_clean_and_lessons_alone_are_trained(trained: Any) -> None:
@@ -313,6 +313,7 @@ def test_the_gain_per_step_sums_to_the_change_of_return() -> None:
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "another reflection": ({"agent": {"reflection": "reflexion"}}, "reflection: retroformer"),
     "lessons at the end": ({"agent": {"reflection": {"name": "retroformer", "when": "end"}}}, "when: start"),
+    "no lessons": ({"agent": {"reflection": {"name": "retroformer", "control": "x"}}}, "none is sampled"),
     "greedy lessons": ({"agent": {"reflection": {"name": "retroformer", "temperature": 0}}}, "temperature is 0"),
     "a trained actor": ({"train_calls": ["reasoning.*", PATH]}, "the actor is frozen"),
     "another reward": ({"rewards": {"earning_delta": 1.0}}, "reflection_gain"),

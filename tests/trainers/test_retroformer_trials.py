@@ -10,7 +10,7 @@ import pytest
 from agentspec.episode import Job, Runner
 from agentspec.llm.base import ContextOverflowError
 from agentspec.llm.scripted import ScriptedLLM
-from agentspec.reflection.retroformer import PATH, Retroformer, reflection_samples
+from agentspec.reflection.retroformer import PATH, Retroformer
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
@@ -45,8 +45,8 @@ def test_the_same_lesson_one_episode_later() -> None:
     for played, call in ((at_end, lesson), (at_start, later)):
         assert call.completions[0].credit == "executed" and call.sampling.temperature == 0.5
         assert played[1].metrics["reflection/reward"] == 1.0  # the puzzle pays 1 when it is solved
-        (sample,) = reflection_samples(played)
-        assert sample.reward == 1.0 and sample.call == call
+        paid = played[1].metrics["reflection/episode"], played[1].metrics["reflection/call"]
+        assert paid == (f"{call.tag.episode}", call.id)
 
 
 def test_lessons_drawn_from_one_memory_are_paid_each_by_its_own_trial() -> None:
@@ -61,8 +61,7 @@ def test_lessons_drawn_from_one_memory_are_paid_each_by_its_own_trial() -> None:
     llm = ScriptedLLM(script)
     both = Runner(spec, llm).run([Job(TASK, i, memory_state=state) for i in range(2)])
     assert [t.metrics["reflection/reward"] for t in both] == [1.0, 0.0]
-    samples = reflection_samples(both)
-    assert [s.reward for s in samples] == [1.0, 0.0] and len({s.group for s in samples}) == 1
+    assert len({lessons(t)[0].prompt_ids for t in both}) == 1  # about one and the same failed trial
     # An empty answer is a choice as well, and it is paid; but it is no lesson.
     assert lessons(both[1])[0].completions[0].credit == "executed"
     prompts = [llm.tokenizer.decode(t.calls[1].prompt_ids) for t in both]

@@ -26,7 +26,7 @@ from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
-from trainers.credit import Credited, CreditRule, is_overlong
+from trainers.credit import Credited, is_overlong
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
 from trainers.supo import as_supo
@@ -43,7 +43,7 @@ def configured(tmp_path: Path, **changes: Any) -> ScaffoldConfig:
 
 
 def credited(episodes: Sequence[Trajectory], config: ScaffoldConfig) -> Credited:
-    rule = CreditRule.from_config(config)
+    rule = config.credit_rule
     return rule.credit(rule.score(episodes))
 
 
@@ -206,7 +206,8 @@ def test_truncated_summaries_are_counted_and_masked(tmp_path: Path) -> None:
 
 def test_an_episode_that_runs_out_of_context_after_a_summary_is_overlong(tmp_path: Path) -> None:
     """Whatever the estimator: the summary's last segment is rolled back neither in the record nor in the baseline."""
-    spec = {"reasoning": "direct", "memory": {"name": "summary", "every": 2, "max_summaries": 1}}
+    memory = {"name": "summary", "every": 2, "max_summaries": 1}
+    spec = {"reasoning": "direct", "memory": memory, "sampling": {"max_tokens": 256}}
     whole = played(spec=spec)
     acts = [len(c.prompt_ids) for c in whole[0].calls if c.tag.purpose == "act"]
     # Room for the acts of the first segment and the summary, not for the whole second segment.

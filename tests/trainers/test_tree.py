@@ -14,7 +14,8 @@ pytest.importorskip("trl")
 from tests.tiny import tiny_model, tiny_tokenizer
 from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence
-from trainers.tree import build_tree, enable_tree
+from trainers.tree.model import enable_tree
+from trainers.tree.trie import build_tree
 
 
 def test_a_fork_is_stored_once() -> None:

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.attention.flex_attention import flex_attention
 
-from trainers.tree import Tree, build_tree, tree_attention
 from trainers.tree import attention as tree_module
+from trainers.tree.attention import tree_attention
 from trainers.tree.flex import sees, subtree_ends, usable
+from trainers.tree.trie import Tree, build_tree
 
 SEQUENCES = st.lists(st.lists(st.integers(0, 2), min_size=1, max_size=9), min_size=1, max_size=8)
 

@@ -62,7 +62,7 @@ def test_training_goes_on_as_if_nothing_had_been_evaluated(tmp_path: Path) -> No
 
 def test_the_best_checkpoint_is_kept_and_can_be_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scores = iter([1.0, 3.0, 2.0, 0.0])
-    monkeypatch.setattr("trainers.grpo.validate", lambda *args, **kwargs: {"reward": next(scores)})
+    monkeypatch.setattr("trainers.validation.validate", lambda *args, **kwargs: {"reward": next(scores)})
     run = validating(tmp_path, save_total_limit=2, load_best_model_at_end=True)
     run.train()
     kept = sorted(p.name for p in tmp_path.glob("checkpoint-*"))

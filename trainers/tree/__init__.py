@@ -7,19 +7,3 @@ Everything else in a decoder works token by token and does not notice. The log-p
 read off per row, so a shared token collects the gradients of all rows it belongs to: loss and gradients equal those of
 separate padded rows.
 """
-
-from trainers.tree.attention import tree_attention
-from trainers.tree.model import TreeOutput, Wanted, enable_tree, packed_inputs, wanted_tokens
-from trainers.tree.trie import Node, Tree, build_tree
-
-__all__ = [
-    "Node",
-    "Tree",
-    "TreeOutput",
-    "Wanted",
-    "build_tree",
-    "enable_tree",
-    "packed_inputs",
-    "tree_attention",
-    "wanted_tokens",
-]

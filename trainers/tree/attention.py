@@ -19,7 +19,7 @@ ATTENTION = "agentspec_tree"
 
 
 def register(base: Any) -> None:
-    """Make the tree attention known to transformers and to every config of ``base``."""
+    """Make the tree attention known to transformers and to every config of `base`."""
     from transformers.masking_utils import ALL_MASK_ATTENTION_FUNCTIONS, sdpa_mask
     from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 
@@ -45,8 +45,8 @@ def tree_attention(
 ) -> tuple[torch.Tensor, None]:
     """Attention along each node's path.
 
-    ``query`` (1, heads, N, size), ``key`` and ``value`` (1, kv heads, N, size); returns (1, N, heads, size). Without a
-    tree this is transformers' SDPA. With one: node by node on a CPU, one kernel (:mod:`trainers.tree.flex`) elsewhere.
+    `query` (1, heads, N, size), `key` and `value` (1, kv heads, N, size); returns (1, N, heads, size). Without a
+    tree this is transformers' SDPA. With one: node by node on a CPU, one kernel (`trainers.tree.flex`) elsewhere.
     """
     if tree is None:
         from transformers.integrations.sdpa_attention import sdpa_attention_forward

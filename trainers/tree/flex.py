@@ -1,9 +1,9 @@
 """Tree attention in one kernel, for accelerators: a packed row in which every token sees its own path.
 
 Nodes are packed parents first, each subtree in one piece. So token j is on the path of token i exactly if
-``j <= i < end(j)``, where ``end(j)`` is the place after the last token below j: one integer per token says it all, and
+`j <= i < end(j)`, where `end(j)` is the place after the last token below j: one integer per token says it all, and
 FlexAttention (Dong et al., 2024) skips every block in which nobody sees anybody. On a CPU, where it has no backward
-pass, attention goes node by node (:func:`trainers.tree.attention.tree_attention`).
+pass, attention goes node by node (`trainers.tree.attention.tree_attention`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def sees(ends: torch.Tensor, positions: torch.Tensor, window: int = 0) -> Callab
     """FlexAttention's mask function: whether the query at place i sees the key at place j.
 
     Args:
-        ends: (N,), of :func:`subtree_ends`.
+        ends: (N,), of `subtree_ends`.
         positions: (N,), of each token in its own sequence.
         window: most positions a query sees, itself included (0: all).
     """

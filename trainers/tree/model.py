@@ -29,7 +29,7 @@ HEAD_CHUNK = 1024
 class Wanted:
     """Trained tokens whose log-probability is wanted, one entry per (row, position).
 
-    ``before`` is the packed place of the token before it (whose logits decide it).
+    `before` is the packed place of the token before it (whose logits decide it).
     """
 
     before: torch.Tensor
@@ -46,7 +46,7 @@ class TreeOutput(NamedTuple):
 
 
 def enable_tree(model: nn.Module) -> None:
-    """Teach ``model`` (or the base of a PEFT model) the packed forward: ``model(..., tree=Tree, wanted=Wanted)``.
+    """Teach `model` (or the base of a PEFT model) the packed forward: `model(..., tree=Tree, wanted=Wanted)`.
 
     Without these arguments its forward is the one it had. Idempotent.
 
@@ -79,7 +79,7 @@ def enable_tree(model: nn.Module) -> None:
 
 
 def _enable_head(model: Any) -> None:
-    """Teach the output projection to give log-probabilities: ``head(states, wanted=Wanted)``, states (K, hidden).
+    """Teach the output projection to give log-probabilities: `head(states, wanted=Wanted)`, states (K, hidden).
 
     The vocabulary is projected on chunk by chunk, chunks being recomputed backward, but within one call of the module:
     where weights are sharded, each call is an event that all ranks must have the same number of.

@@ -18,7 +18,7 @@ NODE_TOKENS = 512
 
 @dataclass(frozen=True)
 class Node:
-    """Tokens ``start .. end`` of the packed row; ``path`` holds the indices of its ancestors, root first."""
+    """Tokens `start .. end` of the packed row; `path` holds the indices of its ancestors, root first."""
 
     start: int
     end: int
@@ -29,7 +29,7 @@ class Node:
 class Tree:
     """Sequences packed into a trie.
 
-    ``tokens`` and ``positions`` have one entry per unique token; ``places[r][p]`` is where token p of sequence r is.
+    `tokens` and `positions` have one entry per unique token; `places[r][p]` is where token p of sequence r is.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -90,7 +90,7 @@ def build_tree(sequences: Sequence[Sequence[int]], node_tokens: int = NODE_TOKEN
 
 
 def _split(group: list[int], sequences: Sequence[Sequence[int]], depth: int) -> list[list[int]]:
-    """Runs of ``group`` with the same token at ``depth``."""
+    """Runs of `group` with the same token at `depth`."""
     runs: list[list[int]] = []
     for i in group:
         if runs and sequences[runs[-1][0]][depth] == sequences[i][depth]:

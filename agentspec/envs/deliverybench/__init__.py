@@ -6,7 +6,21 @@ couriers: baseline and demonstrator). `env` puts them behind Gymnasium's interfa
 recorded episodes of the original.
 """
 
-from agentspec.envs.deliverybench.city.citymap import City, MapError, load_city
-from agentspec.envs.deliverybench.city.generate import generate, split_of, write_city
+from agentspec.envs.registration import register_env
 
-__all__ = ["City", "MapError", "generate", "load_city", "split_of", "write_city"]
+STEP_LIMIT = 5000
+"""Steps after which every episode is cut: some actions take no time."""
+
+register_env(
+    "agentspec/DeliveryBench-v0",
+    "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
+    name="deliverybench",
+    summary="a courier earns money in a city: orders, deadlines, battery, energy, hot and cold food",
+    max_episode_steps=STEP_LIMIT,
+)
+# The same world with numbers for actions and observations, for other libraries.
+register_env(
+    "agentspec/DeliveryBenchDiscrete-v0",
+    "agentspec.envs.deliverybench.discrete:make",
+    max_episode_steps=STEP_LIMIT,
+)

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from agentspec.envs.deliverybench import STEP_LIMIT
 from agentspec.envs.deliverybench.city.generate import city_of
 from agentspec.envs.deliverybench.outcome import MAX_ACTION, Last, plan_of
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe, state_hash
@@ -43,9 +44,6 @@ from agentspec.types import ActionError, ActionSchema
 
 CHARSET = string.printable
 MAX_TEXT = 100_000
-STEP_LIMIT = 5000
-"""Steps after which every episode is cut, the limit registered with Gymnasium: some actions take no time."""
-
 SHORTEST_PLAYED_H = 1.0 / 60.0
 """Least time that the profit of a cut episode is divided by."""
 
@@ -332,7 +330,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
             return menu_text(view, said, self.menu)
         if self.compact:
             return compact_text(view, last.message)
-        return full_text(view, around(self.city, self.world.state.position, view), self._plan, self.menu)
+        surrounding = around(self.city, self.world.state.position, view)
+        return full_text(view, surrounding, self._plan, self.menu, message=last.message)
 
     def _native(self, text: str) -> tuple[str, str]:
         """The native call for an answer, and in menu mode the problem with an answer that is neither."""

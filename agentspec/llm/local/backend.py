@@ -2,7 +2,7 @@
 
 `LocalLLM` turns requests into token rows (`agentspec.llm.chat`), gathers those of all live episodes into one batch
 (`agentspec.llm.batching`) and runs it without padding on cached prefixes (`agentspec.llm.local.engine`). The model is
-never moved, cast or left changed, so a trainer can hand over the model it optimises; its weights may change between
+never moved, cast or left changed, so a trainer can give the model it optimises; its weights may change between
 batches (the caches notice in-place updates; call `LocalLLM.invalidate` after any other change).
 """
 
@@ -37,20 +37,20 @@ class LocalLLM:
         name: model name in the records.
         max_batch: samples that run at once.
         max_cache_tokens: token positions kept in the prefix cache; one costs
-            ``2 * layers * key_value_heads * head_size`` numbers.
+            `2 * layers * key_value_heads * head_size` numbers.
         max_context: context window; by default the model's.
-        template_kwargs: variables of the chat template, e.g. ``{"enable_thinking": False}``.
+        template_kwargs: variables of the chat template, e.g. `{"enable_thinking": False}`.
         patience_s: see `agentspec.llm.batching.Batcher`.
         batching: `"continuous"` or `"closed"` (see `agentspec.llm.batching`). `"auto"` is `"continuous"` where that is
             repeatable to the last bit: where the model's arithmetic is found to be batch-invariant (float32 on a CPU).
             Elsewhere (accelerators, 16-bit floats, mixtures of experts) it is `"closed"`, and a warning says so.
         adapters: which adapter of a PEFT model answers which calls: shell pattern over the call's tag path -> name,
             first match wins (see `agentspec.llm.local.adapters`), e.g.
-            ``{"reflection.retroformer/*": "reflector", "*": "actor"}``. What matches nothing is answered by the
+            `{"reflection.retroformer/*": "reflector", "*": "actor"}`. What matches nothing is answered by the
             adapter that is active.
 
     Raises:
-        ValueError: an unknown ``batching``.
+        ValueError: an unknown `batching`.
         LLMError: the model does not have an adapter named, or its architecture cannot run in this backend (checked
             again, numerically, before the first batch).
     """
@@ -110,8 +110,8 @@ class LocalLLM:
         Args:
             name_or_path: which model.
             adapter: a PEFT adapter folder to put on it.
-            dtype: ``"auto"`` (as stored), ``"float32"``, ``"bfloat16"`` or ``"float16"``.
-            device: ``"auto"`` (the first accelerator, else the CPU) or a torch device.
+            dtype: `"auto"` (as stored), `"float32"`, `"bfloat16"` or `"float16"`.
+            device: `"auto"` (the first accelerator, else the CPU) or a torch device.
             name: model name in the records; by default the one it was found by.
             kwargs: as of `LocalLLM`.
 
@@ -142,7 +142,7 @@ class LocalLLM:
         return cls(model, tokenizer, name=name or source.name, **kwargs)
 
     async def generate(self, request: Request) -> LLMCall:
-        """Sample ``request.sampling.n`` completions (see `agentspec.llm.base.LLM`)."""
+        """Sample `request.sampling.n` completions (see `agentspec.llm.base.LLM`)."""
         began = time.perf_counter()
         sampling = request.sampling
         prompt = self.chat.render(request.messages)
@@ -160,7 +160,7 @@ class LocalLLM:
     ) -> tuple[float, ...]:
         """Log-probability of each continuation after the prompt; what they share is computed once.
 
-        A scoring carries no tag: of ``adapters``, only a pattern that matches everything routes it.
+        A scoring carries no tag: of `adapters`, only a pattern that matches everything routes it.
         """
         if not continuations:
             return ()
@@ -172,7 +172,7 @@ class LocalLLM:
         return job.scores
 
     def count_tokens(self, text: str) -> int:
-        """Number of tokens of ``text``."""
+        """Number of tokens of `text`."""
         return self.chat.count_tokens(text)
 
     def enter(self, episode: str) -> None:

@@ -14,7 +14,7 @@ a thread's share by another formula. So the last bits of a row depend on how man
 - Activation functions are computed in pieces that end where whole vectors end.
 
 Attention takes care of itself (`agentspec.llm.local.attention`). Whether all that holds for a model, on the machine
-and with the number of threads at hand, is tried out by `agentspec.llm.local.probe`, never assumed.
+and with the present number of threads, is tried out by `agentspec.llm.local.probe`, never assumed.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ from typing import Any
 
 from agentspec.llm.base import Message
 from agentspec.prompting import with_request
-from agentspec.reading import visible
 from agentspec.reasoning.search.meter import Ask, Meter
+from agentspec.visible import visible
 
 RATINGS = tuple(range(1, 11))
 UNREAD = 0.5

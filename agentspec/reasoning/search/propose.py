@@ -10,9 +10,11 @@ from typing import Any
 from agentspec.actions import canonical, parse_action
 from agentspec.llm.base import Message
 from agentspec.prompting import with_request
-from agentspec.reading import labelled, read, takes_lines, visible
+from agentspec.reading import labelled, read
 from agentspec.reasoning.search.meter import Meter
 from agentspec.types import Action, ActionSchema, LLMCall
+from agentspec.values import takes_lines
+from agentspec.visible import visible
 
 MAX_LINE = 200
 """Characters of a step that is only imagined: a longer line is no action."""

@@ -15,11 +15,11 @@ from typing import Any, Protocol
 from agentspec.llm.base import Message
 from agentspec.prompting import Step, course, with_request
 from agentspec.protocols import Services, Simulator
-from agentspec.reading import visible
 from agentspec.reasoning.search.judge import last_amount
 from agentspec.reasoning.search.meter import Meter
 from agentspec.reasoning.search.tree import Node
 from agentspec.types import ActionSchema, AgentInput
+from agentspec.visible import visible
 
 PREDICT = (
     "Nobody acts now; imagine. What would be observed after the last step above? Write the new situation in at most "

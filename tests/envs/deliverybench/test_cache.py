@@ -92,16 +92,3 @@ def test_many_processes_at_once(folder: Path) -> None:
     answers = {process.communicate(timeout=120)[0].strip() for process in running}
     assert answers == {str(len(fresh(folder).pois))}
     assert len(files()) == 1  # no temporary file is left
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "data"
-    cache.write_atomic(target, b"old")
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(cache.os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        cache.write_atomic(target, b"new")
-    assert target.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["data"]

@@ -86,8 +86,8 @@ def test_door_and_dock_by_hand() -> None:
     assert Counter(e.kind for e in city.walk.edges)["aux_ext"] == 1
     # Pavement from one dock to the other, 45 m, and both ways to the door, 16 m each.
     assert city.door_distance(restaurant, beyond) == pytest.approx(4500.0 + 2 * 1600.0)
-    length, nodes = city.door_path(restaurant, beyond)
-    assert length == city.door_distance(restaurant, beyond)
+    anchors = city.router.anchors
+    nodes = city.router.walk.path(anchors[restaurant.id], anchors[beyond.id])
     assert nodes == (restaurant.anchor, restaurant.dock, (1700.0, 1700.0), beyond.dock, beyond.anchor)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import random
 import re
 
@@ -12,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import agentspec.envs
+from agentspec.envs import deliverybench
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
 from agentspec.types import ActionSchema
@@ -42,7 +43,7 @@ def test_gymnasium_checker_passes(options: dict) -> None:
 
 def test_registration_is_idempotent() -> None:
     before = gymnasium.registry[ID]
-    agentspec.envs.register_all()
+    importlib.reload(deliverybench)
     assert gymnasium.registry[ID] is before
 
 

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agentspec.envs import deliverybench
 from agentspec.envs.deliverybench.city.__main__ import main
 from agentspec.envs.deliverybench.city.citymap import City, load_city
 from agentspec.envs.deliverybench.city.generate import (
@@ -123,7 +122,7 @@ def test_command_line_writes_cities_and_names_their_split(tmp_path, capsys) -> N
     assert main([str(tmp_path), "--size", "tiny", "--seed", "9999", "--count", "2"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.rsplit("(")[-1] for line in lines] == ["train)", "validation)"]
-    loaded, made = load_city(tmp_path / "tiny-10000"), deliverybench.generate("tiny", 10_000)
+    loaded, made = load_city(tmp_path / "tiny-10000"), generate("tiny", 10_000)
     assert [poi.anchor for poi in loaded.pois] == [poi.anchor for poi in made.pois]
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--seed", "30000"])

@@ -16,6 +16,7 @@ from agentspec.envs.deliverybench.view.compact import compact_text
 from agentspec.envs.deliverybench.view.full import around, full_text, surroundings
 from agentspec.envs.deliverybench.view.hints import hints
 from agentspec.envs.deliverybench.view.instruction import instruction
+from agentspec.envs.deliverybench.view.wording import exactly
 from agentspec.envs.deliverybench.world.engine import World
 from agentspec.envs.deliverybench.world.grammar import advertised, schema_for
 from agentspec.envs.deliverybench.world.notes import METHODS
@@ -95,20 +96,70 @@ def test_full_text_has_its_sections_in_order() -> None:
     for action in ("ACCEPT_ORDER([0])", "FLY()", "VIEW_ORDERS()", "DROP_OFF(oid=0, method='knock')"):
         world.step(action)
     view = describe(world, cards)
-    text = full_text(view, around(world.city, world.state.position, view))
+    text = full_text(view, around(world.city, world.state.position, view), message="looked at the bag")
     titles = [
         "on the clock",
         "Your orders",
         "Hands and bag",
         "Orders on offer",
         "Around you",
-        "Recent actions",
+        "Last action",
         "Last error",
     ]
     positions = [text.index(title) for title in titles]
     assert positions == sorted(positions)
-    assert "viewed the orders on offer (newest)" in text and "not picked up yet" in text
+    assert "not picked up yet" in text
     assert world.book[0].pickup.road in text
+
+
+def test_what_the_last_action_did_stands_in_the_text_once_and_what_came_before_does_not() -> None:
+    """The full text used to list five recent actions, which a transcript or a memory tells as well, and no payment."""
+    env = DeliveryBenchEnv(size="tiny")
+    text = env.reset(seed=0)[0]["text"]
+    assert "Last action" not in text
+    for action, told in (("VIEW_BAG()", "viewed the bag"), ("WAIT(7)", "waited 7s"), ("FLY()", "failed: ")):
+        text = env.step(action)[0]["text"]
+        assert text.count(told) == 1 and f"Last action: {told}" in text, text
+        assert text.count("FLY") <= 1 and ("viewed the bag" in text) is (action == "VIEW_BAG()")
+    courier, info, paid = RuleBasedCourier(env.city), env.observe()[1], ""
+    while not paid:
+        observation, reward, _, _, info = env.step(courier.act(info))
+        paid = f"${reward:.2f}" if "delivered" in info["events"] else ""
+    assert f"stars, {paid}" in observation["text"].partition("Last action: ")[2]
+
+
+def test_times_are_told_to_the_second_and_once() -> None:
+    """`5 min left` used to mean anything above four, and a hint rounded the same wait another way."""
+    assert [exactly(s) for s in (0.0, 59.4, 60.0, 185.0, 3600.0, 4800.0)] == [
+        *("0 s", "59 s", "1 min", "3 min 5 s", "1 h", "1 h 20 min")
+    ]
+    world, cards = fresh()
+    world.step("ACCEPT_ORDER([0])")
+    placed(world, world.book[0].pickup.anchor)
+    world.step(f"WAIT({world.book[0].prep - 65})")
+    view = describe(world, cards)
+    for text in (full_text(view, ""), compact_text(view, "")):
+        assert "ready in 1 min 5 s" in text and text.count("1 min 5 s") == 1
+        assert "wait until order 0 is ready: WAIT(65)" in text
+
+
+def test_a_place_has_the_same_coordinates_in_the_rules_and_in_the_offers() -> None:
+    """(175.8m, 75.3m) in the list of places was (175.8m, 75.2m) on the board: two roundings of 75.25."""
+    for seed in range(4):
+        env = DeliveryBenchEnv(size="small", city_seed=seed)
+        observation, info = env.reset(seed=0)
+        observation = env.step("VIEW_ORDERS()")[0]
+        where = dict(re.findall(r"From (restaurant \d+) (\(.*?\))", observation["text"]))
+        assert where and all(f"{name} {point}" in info["instruction"] for name, point in where.items())
+
+
+def test_the_rules_tell_what_a_plan_rests_on() -> None:
+    text = instruction(generate("tiny", 0), rules_named("fair"), 1.0, compact=False, menu=False)
+    # Popsicles take 30 s, curry 420 s; ten orders at a time; after 60 s the pay shrinks, to half at worst.
+    assert "the time allowed begins" in text and "starts cooking (1 to 7 min)" in text
+    assert "(at most 10)" in text and "From 60s late on the pay shrinks, down to 50 %" in text
+    assert "Otherwise only moving, waiting, resting and the bus take time" in text
+    assert "Smelly: Coffee, Durian, StinkyTofu, BlueCheese." in text and "Fragile: Noodles, Salad" in text
 
 
 def test_offers_are_listed_only_after_looking_at_them() -> None:
@@ -139,7 +190,8 @@ def test_late_orders_and_charging_are_shown() -> None:
     world.step("ACCEPT_ORDER([0])")
     world.step(f"WAIT({world.book[0].limit + 61})")
     text = full_text(describe(world, cards), "")
-    assert "order 0: ready, 2 min late" in text  # 61 s over the limit, whole minutes rounded up
+    # 61 s over the limit, and a tenth of a second at most by which the limit is no whole number of seconds.
+    assert "order 0: ready, 1 min 1 s late" in text
     x, y = (c / 100 for c in world.city.pois_of("charging_station")[0].anchor)
     world.step(f"MOVE({x:.2f}m, {y:.2f}m)")
     world.step("CHARGE(target_pct=80)")

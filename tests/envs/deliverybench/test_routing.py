@@ -50,8 +50,8 @@ def test_order_paths_equal_the_reference(trace: Path) -> None:
         orders += step["new_pool_orders"] or []
     for order in orders:
         pickup, dropoff = (doors[tuple(round(100 * c, 2) for c in order[side])] for side in ("pickup_xy", "dropoff_xy"))
-        length, nodes = city.door_path(pickup, dropoff)
-        assert length / 100 == pytest.approx(order["distance_m"], abs=1e-6)
+        nodes = city.router.walk.path(city.router.anchors[pickup.id], city.router.anchors[dropoff.id])
+        assert city.door_distance(pickup, dropoff) / 100 == pytest.approx(order["distance_m"], abs=1e-6)
         assert (pickup.road, dropoff.road) == (order["pickup_road"], order["dropoff_road"])
         assert len(nodes) == len(order["path_xy"])
         assert all(math.dist(p, (100 * x, 100 * y)) < 0.1 for p, (x, y) in zip(nodes, order["path_xy"], strict=True))

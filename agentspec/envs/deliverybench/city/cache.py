@@ -14,7 +14,6 @@ import io
 import json
 import os
 import sys
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -28,6 +27,7 @@ import numpy.typing as npt
 from agentspec.envs.deliverybench.city.compile import STREET_KINDS, Poi
 from agentspec.envs.deliverybench.city.graph import Edge, Graph, all_pairs
 from agentspec.envs.deliverybench.city.routing import Network, Table
+from agentspec.files import write_atomic
 
 CACHE_VARIABLE = "AGENTSPEC_CACHE"
 FORMAT = 1
@@ -88,19 +88,6 @@ def write_compiled(key: str, compiled: Compiled) -> bool:
     except OSError:
         return False
     return True
-
-
-def write_atomic(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old content or all of the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _path(key: str) -> Path:

@@ -185,11 +185,6 @@ class City:
         anchors = self.router.anchors
         return self.router.walk.from_node(anchors[a.id])[anchors[b.id]]
 
-    def door_path(self, a: Poi, b: Poi) -> tuple[float, tuple[Point, ...]]:
-        """`door_distance` and the network nodes of that path, both anchors included; no nodes if not connected."""
-        anchors = self.router.anchors
-        return self.door_distance(a, b), self.router.walk.path(anchors[a.id], anchors[b.id])
-
     def distances_from(self, p: Point) -> DistanceField:
         """Path distances (cm) from the pavement point nearest to `p`; `.to(poi)` looks one up."""
         return self.router.field(p)

@@ -17,12 +17,11 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from agentspec.envs.deliverybench.city.cache import write_atomic
 from agentspec.envs.deliverybench.city.citymap import MEMORY_LIMIT, ROADS_FILE, WORLD_FILE, City, build_city, load_city
+from agentspec.files import write_atomic
 
-Size = Literal["tiny", "small", "medium", "large"]
 Cell = tuple[int, int]
 Street = tuple[Cell, Cell]
 

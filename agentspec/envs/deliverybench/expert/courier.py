@@ -290,8 +290,4 @@ def _point(xy: Sequence[float]) -> Point:
     return (xy[0], xy[1])
 
 
-def _metres_of(point: Point) -> Point:
-    return (point[0] / 100.0, point[1] / 100.0)
-
-
 __all__ = ["RandomCourier", "RuleBasedCourier", "Style"]

@@ -8,7 +8,17 @@ from agentspec.envs.deliverybench.view.calls import Card, View
 from agentspec.envs.deliverybench.view.cards import PREPARING
 from agentspec.envs.deliverybench.view.choices import Option, best_offers
 from agentspec.envs.deliverybench.view.hints import hints
-from agentspec.envs.deliverybench.view.wording import HERE, SHORT_MODE, at, away, cut, deadline, minutes
+from agentspec.envs.deliverybench.view.wording import (
+    HERE,
+    SHORT_MODE,
+    at,
+    away,
+    cut,
+    deadline,
+    exactly,
+    in_minutes,
+    minutes,
+)
 
 COMPACT_OFFERS = 3
 LOW, THIRSTY = 40.0, 50.0
@@ -57,14 +67,14 @@ def _menu_order(order: Card) -> str:
     if status == PREPARING:
         status = f"ready in {minutes(order['ready_in_s'])} min"
     where = "" if order["picked"] else f" at {order['pickup']}"
-    return f"order {order['id']}: {status}{where}, {deadline(order['time_left_s'])}, ${order['pay']:.1f}"
+    return f"order {order['id']}: {status}{where}, {deadline(order['time_left_s'], in_minutes)}, ${order['pay']:.1f}"
 
 
 def _courier(view: View) -> str:
     place = f"at {view['place']} " if view["place"] else ""
     held = ", ".join(f"{n} {item}" for item, n in view["inventory"].items())
     text = (
-        f"{minutes(view['left_s'])} min left, {place}{at(view['position'])}, "
+        f"{exactly(view['left_s'])} left, {place}{at(view['position'])}, "
         f"{SHORT_MODE.get(view['mode'], view['mode'])}, battery {view['battery']:.0f}% ({view['range_m']:.0f}m), "
         f"energy {view['energy']:.0f}%, ${view['balance']:.2f}, earned ${view['net_earnings']:.2f}"
     )
@@ -73,14 +83,14 @@ def _courier(view: View) -> str:
     if view["car"] is not None and view["car"]["at"] is not None:
         text += f", car at {at(view['car']['at'])}"
     if view["charging"] is not None:
-        text += f", charging {minutes(view['charging']['left_s'])} min more"
+        text += f", charging {exactly(view['charging']['left_s'])} more"
     return text + (f", you have {held}" if held else "")
 
 
 def _order(view: View, order: Card) -> str:
     status = order["status"]
     if status == PREPARING:
-        status = f"ready in {minutes(order['ready_in_s'])} min"
+        status = f"ready in {exactly(order['ready_in_s'])}"
     picked = order["picked"]
     if picked:
         xy, metres, goal = order["dropoff_xy"], order["to_dropoff_m"], "drop-off"
@@ -111,7 +121,7 @@ def _offer(view: View, offer: Card) -> str:
     return (
         f"offer {offer['id']}: ${offer['pay']:.2f}, {offer['pickup']} {at(offer['pickup_xy'])} "
         f"{away(view, offer['pickup_xy'], offer['to_pickup_m'])}, then to {at(offer['dropoff_xy'])} "
-        f"{offer['distance_m']}m, {minutes(offer['limit_s'])} min{note}"
+        f"{offer['distance_m']}m, {exactly(offer['limit_s'])}{note}"
     )
 
 

@@ -1,7 +1,8 @@
 """The full text: everything that changes, in the sections of the benchmark's observation.
 
 Clock and courier, own orders, hands and bag, orders on offer (after VIEW_ORDERS), what can be done here, surroundings,
-recent actions, last error, news, plan. What never changes stands in the instruction. Everything is written from the
+what the last action did, news, plan. What never changes stands in the instruction, what came
+before the last action in the conversation or in memory. Everything is written from the
 view of `cards.describe` alone; only the streets around come from the city.
 """
 
@@ -24,17 +25,16 @@ from agentspec.envs.deliverybench.view.wording import (
     away,
     clock,
     deadline,
-    duration,
+    exactly,
     listing,
-    minutes,
 )
 
 
-def full_text(view: View, surrounding: str, plan: str = "", menu: Sequence[Option] = ()) -> str:
+def full_text(view: View, surrounding: str, plan: str = "", menu: Sequence[Option] = (), *, message: str = "") -> str:
     """The full dynamic text.
 
-    `surrounding` is the section that `around` writes; `plan` what the agent last planned. With a `menu` its choices
-    take the place of the hints, and the offers are always listed.
+    `surrounding` is the section that `around` writes; `plan` what the agent last planned; `message` what the last
+    action did. With a `menu` its choices take the place of the hints, and the offers are always listed.
     """
     possible = [] if menu else hints(view)
     sections = [
@@ -44,13 +44,14 @@ def full_text(view: View, surrounding: str, plan: str = "", menu: Sequence[Optio
         _offers(view, bool(menu)),
         listing("Here you can", possible, "") if possible else "",
         surrounding,
-        listing("Recent actions", [*view["recent"][:-1], *(f"{a} (newest)" for a in view["recent"][-1:])], "none"),
+        f"Last action: {message}" if message else "",
     ]
-    if view["error"]:
+    if view["error"] and view["error"] not in message:
         sections.append(f"Last error: {view['error']}")
     if plan:
         sections.append(f"Your plan: {plan}")
-    news = [notice["text"] for notice in view["notices"] if notice["text"] and notice["kind"] != "bagging"]
+    told = ("bagging", "settled")  # by a hint, and by what the last action did
+    news = [notice["text"] for notice in view["notices"] if notice["text"] and notice["kind"] not in told]
     if news:
         sections.append(listing("News", news, ""))
     if menu:
@@ -88,7 +89,7 @@ def _courier(view: View) -> str:
     place = f"at {view['place']} " if view["place"] else ""
     mode = MODE_WORDS.get(view["mode"], f"by {view['mode']}")
     parts = [
-        f"{clock(view['clock_s'])} on the clock, {duration(view['left_s'])} left.",
+        f"{clock(view['clock_s'])} on the clock, {exactly(view['left_s'])} left.",
         f"You are {place}{at(view['position'])}, {mode} ({view['speed']:g} m/s, pace {view['pace']}).",
         f"Energy {view['energy']:.0f} %. Balance ${view['balance']:.2f} (earned {view['net_earnings']:+.2f}).",
         _scooter(view),
@@ -109,14 +110,14 @@ def _scooter(view: View) -> str:
     if view["scooter_xy"] is not None:
         text += f", parked at {at(view['scooter_xy'])}"
     if view["charging"] is not None:
-        text += f", charging to {view['charging']['target']:.0f} % for {duration(view['charging']['left_s'])} more"
+        text += f", charging to {view['charging']['target']:.0f} % for {exactly(view['charging']['left_s'])} more"
     return text + "."
 
 
 def _order_line(view: View, order: Card) -> str:
     status = order["status"]
     if status == PREPARING:
-        status = f"ready in {duration(order['ready_in_s'])}"
+        status = f"ready in {exactly(order['ready_in_s'])}"
     text = f"order {order['id']}: {status}, {deadline(order['time_left_s'])}, pays ${order['pay']:.2f}."
     if not order["picked"]:
         way = away(view, order["pickup_xy"], order["to_pickup_m"])
@@ -168,7 +169,7 @@ def _offers(view: View, always: bool) -> str:
         foods = ", ".join(f"{name} {calls.FOODS[name].serving:g}C" for name in offer["items"])
         note = f' Note: "{offer["note"]}"' if offer["note"] else ""
         lines.append(
-            f"order {offer['id']}: ${offer['pay']:.2f}, {offer['distance_m']}m, {minutes(offer['limit_s'])} min. "
+            f"order {offer['id']}: ${offer['pay']:.2f}, {offer['distance_m']}m, {exactly(offer['limit_s'])}. "
             f"From {offer['pickup']} {at(offer['pickup_xy'])} {offer['pickup_road']} "
             f"({away(view, offer['pickup_xy'], offer['to_pickup_m'])}) to {at(offer['dropoff_xy'])} "
             f"{offer['dropoff_road']}. {foods}.{note}"

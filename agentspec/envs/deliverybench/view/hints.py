@@ -10,7 +10,7 @@ from agentspec.envs.deliverybench.view import calls
 from agentspec.envs.deliverybench.view.calls import Card, View, within_reach
 from agentspec.envs.deliverybench.view.cards import IN_BAG, IN_HAND, PREPARING, READY
 from agentspec.envs.deliverybench.view.choices import DRINK, PACK
-from agentspec.envs.deliverybench.view.wording import at, duration, joined
+from agentspec.envs.deliverybench.view.wording import at, duration, exactly, joined
 from agentspec.envs.deliverybench.world.notes import HAND, METHODS
 
 
@@ -54,8 +54,7 @@ def _kitchen(view: View) -> list[str]:
     lines = [f"fetch: {calls.pick_up(ready)}"] if ready else []
     for order in here:
         if order["status"] == PREPARING:
-            seconds = order["ready_in_s"]
-            lines.append(f"order {order['id']} will be ready in {duration(seconds)}: {calls.wait(seconds)}")
+            lines.append(f"wait until order {order['id']} is ready: {calls.wait(order['ready_in_s'])}")
     return lines
 
 
@@ -63,9 +62,7 @@ def _vehicle(view: View) -> list[str]:
     lines = []
     if view["mode"] != "e-scooter" and view["scooter_xy"] is not None and within_reach(view, view["scooter_xy"]):
         if view["charging"] is not None:
-            lines.append(
-                f'your scooter is charging for {duration(view["charging"]["left_s"])} more: WAIT("charge_done")'
-            )
+            lines.append('wait until your scooter is charged: WAIT("charge_done")')
         lines.append('your scooter stands here: SWITCH(to="e-scooter")')
     car = view["car"]
     if car is not None and car["at"] is not None and within_reach(view, car["at"]):
@@ -97,7 +94,7 @@ def _bus(view: View) -> list[str]:
     if line is None or not line["here"]:
         return []
     if not (line["stopped"] and line["stop"] == line["here"]):
-        return [f"the bus will stand here in {duration(line['here_s'])}"]
+        return [f"the bus will stand here in {exactly(line['here_s'])}"]
     goals = [stop for stop in dict.fromkeys(line["stops"]) if stop != line["here"]]
     return (
         [f'ride the bus: BOARD_BUS(bus_id="bus_1", target_stop_id="{goals[0]}"), or to {joined(goals[1:])}']

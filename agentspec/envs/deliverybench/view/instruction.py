@@ -6,9 +6,12 @@ answer is not in it: that is the business of whoever asks.
 
 from __future__ import annotations
 
+import math
+
 from agentspec.envs.deliverybench.city.citymap import City
-from agentspec.envs.deliverybench.view.cards import SERVICES
+from agentspec.envs.deliverybench.view.cards import SERVICES, metres
 from agentspec.envs.deliverybench.view.wording import HERE, at, duration
+from agentspec.envs.deliverybench.world.food import MENU
 from agentspec.envs.deliverybench.world.rules import Rules
 
 
@@ -28,7 +31,7 @@ def instruction(city: City, rules: Rules, shift_hours: float, compact: bool, men
     lines += [*_trade(rules, menu), *_numbers(rules), *_habits(rules, compact)]
     parts = [goal, _listed(lines), _prices(rules)]
     if not compact:
-        parts.append(_places(city))
+        parts += [_dishes(), _places(city)]
     return "\n\n".join(parts)
 
 
@@ -48,27 +51,45 @@ def _reach(rules: Rules, compact: bool) -> list[str]:
 def _trade(rules: Rules, menu: bool) -> list[str]:
     """How money is made."""
     lines = [
-        f"A restaurant starts cooking when you accept; an order pays about ${rules.pay_per_km:.0f} per km, plus up to "
-        f"${rules.bonus[5]:.0f} for five stars. From {rules.grace:.0f}s after the deadline on the pay shrinks; what is "
-        "not delivered when the shift ends pays nothing.",
+        f"When you accept, the time allowed begins, and the restaurant starts cooking ({_cooking()}). An order pays "
+        f"about ${rules.pay_per_km:.0f} per km, plus up to ${rules.bonus[5]:.0f} for five stars. From "
+        f"{rules.grace:.0f}s late on the pay shrinks, down to {100 * rules.late_floor:.0f} %; what is undelivered when "
+        "the shift ends pays nothing.",
         "Stars: time first, then food (temperature, smell, damage), then the hand-over the note asks for.",
-        "Carry several orders at once when their restaurants and customers lie on one way; finish what you accepted.",
+        f"Carry several orders at once{_most(rules)} when their restaurants and customers lie on one way; finish what "
+        "you accepted.",
     ]
     if not menu:
         lines.append(
-            "Bag hot and cold food into different compartments, smelly food apart. The pace accel is a quarter faster, "
-            "uses a quarter more energy and battery per metre, and shakes fragile food in the bag."
+            "Bag hot, cold and smelly food apart. The pace accel is a quarter faster, "
+            "uses a quarter more energy and battery per metre, and shakes fragile food."
         )
         if not rules.ride_with_food_in_hand:
-            lines.append("No vehicle moves while you hold food in your hands: put it into the bag first.")
+            lines.append("No vehicle moves while you hold food in your hands: bag it first.")
     return lines
+
+
+def _cooking() -> str:
+    """The range of the dishes' preparation times: `1 to 7 min`."""
+    times = [food.prep / 60.0 for food in MENU]
+    return f"{max(1, math.floor(min(times)))} to {math.ceil(max(times))} min"
+
+
+def _most(rules: Rules) -> str:
+    return "" if rules.max_active_orders is None else f" (at most {rules.max_active_orders})"
+
+
+def _dishes() -> str:
+    """Which dishes are fragile, and which smell."""
+    fragile = ", ".join(food.name for food in MENU if food.fragile)
+    return f"Fragile: {fragile}. Smelly: {', '.join(food.name for food in MENU if food.smells)}."
 
 
 def _numbers(rules: Rules) -> list[str]:
     speed, energy = rules.speed, rules.energy_per_m
     return [
         f"Speed m/s: walk {speed['walk'] / 100:g}, e-scooter {speed['e-scooter'] / 100:g}, dragging it "
-        f"{speed['drag_scooter'] / 100:g}, car {speed['car'] / 100:g}.",
+        f"when its battery is empty {speed['drag_scooter'] / 100:g}, car {speed['car'] / 100:g}.",
         f"Energy %/km: walk {energy['walk'] * 1000:g}, e-scooter {energy['e-scooter'] * 1000:g}, car "
         f"{energy['car'] * 1000:g}; at 0 you wake up in hospital {rules.hospital_seconds / 60:.0f} min later, "
         f"${rules.hospital_fee:.0f} poorer. The scooter's battery loses {rules.battery_per_m * 1000:g} %/km.",
@@ -80,15 +101,16 @@ def _numbers(rules: Rules) -> list[str]:
 def _habits(rules: Rules, compact: bool) -> list[str]:
     """What a courier should and should not do over and over."""
     cost = "" if rules.free_looks else f" (that costs {rules.look_seconds:.0f}s)"
-    board = "The best offers are shown all the time, all of them after VIEW_ORDERS()"
+    board = "The best offers are always shown, all of them after VIEW_ORDERS()"
     if not compact:
-        board = "VIEW_ORDERS() shows the offers"
+        board = "Offers stay until you accept them, and new ones take their place. VIEW_ORDERS() shows them"
     board += f" until you accept, move or work; do not look again while they are shown{cost}. Accept all you want of "
     board += "them in one action."
     return [
         board,
-        "Do not repeat an action that has just failed: read why, and do something else.",
-        "Have a plan for the next stops and keep to it until something changes.",
+        "Otherwise only moving, waiting, resting and the bus take time.",
+        "Do not repeat an action that has just failed: read why.",
+        "Plan the next stops and keep to the plan until something changes.",
     ]
 
 
@@ -118,14 +140,14 @@ def _prices(rules: Rules) -> str:
     return (
         f"Stores sell: {goods}. A drink gives {rules.drink_gain:.0f} % energy, a battery pack fills the scooter's "
         f"battery, an ice or heat pack keeps a compartment cold or hot. A car costs ${rules.rental_per_min:.2f} per "
-        f"minute from renting to returning, the bus ${rules.bus_fare:.2f}."
+        f"minute until you return it and needs no charging; the bus ${rules.bus_fare:.2f}."
     )
 
 
 def _places(city: City) -> str:
     lines = ["Places:"]
     for kind in ("restaurant", *SERVICES):
-        names = [f"{poi.name} {at((poi.anchor[0] / 100.0, poi.anchor[1] / 100.0))}" for poi in city.pois_of(kind)]
+        names = [f"{poi.name} {at(metres(poi.anchor))}" for poi in city.pois_of(kind)]
         if names:
             lines.append("; ".join(names))
     return "\n".join(lines)

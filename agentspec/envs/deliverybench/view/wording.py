@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from agentspec.envs.deliverybench.view.calls import within_reach
@@ -55,9 +55,21 @@ def duration(seconds: float) -> str:
     return f"{hours} h {rest} min" if hours and rest else (f"{hours} h" if hours else f"{rest} min")
 
 
-def deadline(time_left_s: float) -> str:
-    """`3 min left`, `2 min late`."""
-    return f"{minutes(abs(time_left_s))} min {'late' if time_left_s < 0.0 else 'left'}"
+def exactly(seconds: float) -> str:
+    """`40 s`, `6 min 5 s`, `1 h 20 min`, to the second: what a courier plans by. Zero parts are left out."""
+    whole = max(0, round(seconds))
+    parts = ((whole // 3600, "h"), (whole // 60 % 60, "min"), (whole % 60, "s"))
+    return " ".join(f"{n} {unit}" for n, unit in parts if n) or "0 s"
+
+
+def deadline(time_left_s: float, told: Callable[[float], str] = exactly) -> str:
+    """`3 min 5 s left`, `40 s late`; `told` says how exactly."""
+    return f"{told(abs(time_left_s))} {'late' if time_left_s < 0.0 else 'left'}"
+
+
+def in_minutes(seconds: float) -> str:
+    """`4 min`: whole minutes, rounded up, for the short texts of the menu."""
+    return f"{minutes(seconds)} min"
 
 
 def cut(text: str, length: int) -> str:

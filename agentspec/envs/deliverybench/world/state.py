@@ -1,10 +1,10 @@
 """What a delivery world is at one moment: plain mutable data, no logic.
 
 `World.state` is a `State`. Everything a courier could see (and the observation text, the menu and the picture are
-built from) is here, as data and not as text. Times are **ticks** of 0.1 s unless a name ends in ``_seconds``; positions
+built from) is here, as data and not as text. Times are **ticks** of 0.1 s unless a name ends in `_seconds`; positions
 are centimetres; energy and battery run from 0 to 100 %; money is dollars.
 
-Food temperatures change while nobody looks: call ``state.bag.advance(state.tick)`` (`World.look` does) before
+Food temperatures change while nobody looks: call `state.bag.advance(state.tick)` (`World.look` does) before
 reading them.
 """
 
@@ -26,7 +26,7 @@ LEDGER_KINDS = ("orders", "purchases", "charging", "rental", "hospital", "bus")
 
 @dataclass(slots=True)
 class Scooter:
-    """The courier's own e-scooter: ``state`` is usable, depleted or parked; ``park`` (cm) only while parked."""
+    """The courier's own e-scooter: `state` is usable, depleted or parked; `park` (cm) only while parked."""
 
     battery: float
     state: str = USABLE
@@ -35,7 +35,7 @@ class Scooter:
 
 @dataclass(slots=True)
 class Car:
-    """A rented car: ``state`` is usable (driven) or parked; billed from ``since`` until it is returned."""
+    """A rented car: `state` is usable (driven) or parked; billed from `since` until it is returned."""
 
     since: int
     state: str = USABLE
@@ -44,7 +44,7 @@ class Car:
 
 @dataclass(slots=True)
 class Charging:
-    """A running session: started at tick ``since`` and ``first`` %, goes on to ``target`` %; ``cost`` so far."""
+    """A running session: started at tick `since` and `first` %, goes on to `target` %; `cost` so far."""
 
     since: int
     first: float
@@ -54,7 +54,7 @@ class Charging:
 
 @dataclass(slots=True)
 class OrderState:
-    """An accepted, undelivered order. ``pending`` are the items still in the hand (a subset of ``items``)."""
+    """An accepted, undelivered order. `pending` are the items still in the hand (a subset of `items`)."""
 
     offer: Offer
     accepted: int
@@ -76,7 +76,7 @@ class Notice:
 
 @dataclass(slots=True)
 class HelpRequest:
-    """An own request on the board for help: ``kind``, ``bounty`` (dollars), lifetime in seconds (None: no end)."""
+    """An own request on the board for help: `kind`, `bounty` (dollars), lifetime in seconds (None: no end)."""
 
     id: int
     kind: str
@@ -88,13 +88,13 @@ class HelpRequest:
 class State:
     """The complete state of one world; see the module docstring for units.
 
-    ``ledger`` holds signed totals per kind of entry and always adds up to ``balance - initial_balance``. ``orders`` are
-    the accepted, undelivered orders by id; ``settlements`` the delivered ones in order of delivery. ``pool`` lists the
-    ids on offer and ``next_order`` the id that will be drawn next. ``recent`` are the last five successful actions,
-    oldest first; ``error`` is the last failure until something succeeds; ``notices`` last until the next action that
-    clears them; ``requests`` are the own ones on the board for help. ``hospital_until`` is the tick of release;
-    ``interrupt_at`` the tick at which a pending interruption strikes; ``hands_at`` the tick up to which food in hand
-    has cooled. ``reason`` is "" until the episode ends.
+    `ledger` holds signed totals per kind of entry and always adds up to `balance - initial_balance`. `orders` are
+    the accepted, undelivered orders by id; `settlements` the delivered ones in order of delivery. `pool` lists the
+    ids on offer and `next_order` the id that will be drawn next. `recent` are the last five successful actions,
+    oldest first; `error` is the last failure until something succeeds; `notices` last until the next action that
+    clears them; `requests` are the own ones on the board for help. `hospital_until` is the tick of release;
+    `interrupt_at` the tick at which a pending interruption strikes; `hands_at` the tick up to which food in hand
+    has cooled. `reason` is "" until the episode ends.
     """
 
     position: Point
@@ -135,8 +135,3 @@ class State:
     def carrying(self) -> list[int]:
         """Ids of the orders picked up and not yet delivered."""
         return [number for number, order in self.orders.items() if order.picked is not None]
-
-    @property
-    def towing(self) -> bool:
-        """Whether the courier drags the scooter."""
-        return self.mode == "drag_scooter"

@@ -1,0 +1,130 @@
+"""The action at the beginning of a text: a call, a menu entry, data, or a bare name, and what may stand around it.
+
+This is what follows an `Action:` label, and what `agentspec.reading` looks for on every line where there is none.
+"""
+
+from __future__ import annotations
+
+import re
+
+from agentspec import shapes
+from agentspec.literals import Call, known_name, parse_call, scan_call
+from agentspec.types import Action, ActionError, ActionSchema
+
+MOST_CALLS = 64
+"""Opening brackets that are followed in one answer."""
+
+INPUT = re.compile(r"^[ \t*_`]*(?:action[ \t_]*input|arguments|args|parameters|input)[ \t*_`]*:[ \t*_`]*", re.I | re.M)
+DRESS = re.compile(r"^(?:(?:```|~~~)[\w+\-]*\s|[\s>#*_`~\"'•\-]|\(?\d{1,2}[.):](?=\s))+")
+CALL = re.compile(r"([A-Za-z_][\w.]*)[ \t]*\(")
+SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]*\(")
+SQUARE = re.compile(r"([A-Za-z_][\w.\-]*)[ \t]*\[")
+WORD = re.compile(r"[A-Za-z_][\w\-]*")
+REMARK = re.compile(
+    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|"
+    r"(?:because|since|as|to|so|in order|and|then|or|if|for)\b)",
+    re.IGNORECASE,
+)
+
+
+def takes_lines(text: str) -> bool:
+    """Whether one action is spread over several lines: a tool call in tags, or arguments on a line of their own."""
+    return "<function=" in text or "<invoke " in text or INPUT.search(text) is not None
+
+
+class Values:
+    """Reads actions of one schema, each at the beginning of a text; every method gives `None` where there is none."""
+
+    def __init__(self, schema: ActionSchema) -> None:
+        self.schema = schema
+        self.choices = {squeeze(c): c for c in schema.choices}
+        self.scans = 0
+
+    def read(self, text: str) -> Action | ActionError | None:
+        """The action at the beginning of what follows a label."""
+        text = DRESS.sub("", text, count=1) if text.lstrip()[:1] not in ("{", "[") else text.lstrip()
+        choice = self.choice(text)
+        if choice is not None:
+            return choice
+        if text[:1] in ("{", "[", "<"):
+            shape = shapes.find_shape(text, self.schema)
+            if shape is not None and not text[: shape.start].strip("[< \n\t"):
+                return self.read(shape.text)
+        for pattern in (CALL, SPACED_CALL):
+            match = pattern.match(text)
+            if match is not None and (pattern is CALL or known_name(match.group(1), self.schema)):
+                return self.call(text, match)
+        square = SQUARE.match(text)
+        if square is not None and known_name(square.group(1), self.schema):
+            return self.square(text, square)
+        return self.bare(text)
+
+    def call(self, text: str, match: re.Match[str]) -> Action | ActionError | None:
+        """`NAME(arguments)`, its name found by `match`."""
+        self.scans += 1
+        call = scan_call(text, match) if self.scans <= MOST_CALLS else None
+        if call is None:
+            return None
+        if text[call.end : call.end + 1] in ("(", "["):
+            name = known_name(call.name, self.schema) or call.name
+            return ActionError("PARSE_ARGS", f"{name} has more than one list of arguments; write one call", call.text)
+        return parse_call(call, self.schema)
+
+    def square(self, text: str, match: re.Match[str]) -> Action | ActionError | None:
+        """`NAME[args]`, as in ReAct's own prompts; one list for an action that takes one parameter."""
+        call = scan_call(text, match)
+        if call is None:
+            return None
+        name = known_name(call.name, self.schema) or call.name
+        inner = call.arguments
+        if "," in inner and len(self.schema.actions[name].parameters) == 1:
+            inner = f"[{inner}]"
+        return parse_call(Call(name, inner, f"{name}({inner})", call.end), self.schema)
+
+    def bare(self, text: str) -> Action | ActionError | None:
+        """A name without brackets, its arguments perhaps on a line of their own."""
+        match = WORD.match(text)
+        name = known_name(match.group(), self.schema) if match else None
+        if match is None or name is None:
+            return None
+        given = INPUT.search(text, match.end())
+        if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
+            value = (
+                DRESS.sub("", text[given.end() :], count=1)
+                if text[given.end() :][:1] not in "{["
+                else text[given.end() :]
+            )
+            data = shapes.find_shape(f'{{"action": "{name}", "args": ' + value.rstrip("`\n ") + "}", self.schema)
+            line = first_line(value).strip("`\"'* ")
+            inner = data.text if data is not None else f"{name}({line})"
+            return self.read(inner)
+        if not REMARK.match(text, match.end()):
+            return None
+        spec = self.schema.actions[name]
+        missing = [p for p, parameter in spec.parameters.items() if parameter.required]
+        if missing:
+            problem = f"{name} needs {', '.join(missing)}; write {spec.example or name}"
+            return ActionError("PARSE_ARGS", problem, name)
+        return Action(name, text=f"{name}()")
+
+    def choice(self, text: str) -> Action | None:
+        """The longest menu entry that `text` begins with, a remark at most after it."""
+        line = first_line(text)
+        squeezed = squeeze(line)
+        if squeezed in self.choices:
+            return Action(self.choices[squeezed], text=self.choices[squeezed])
+        folded = line.casefold()
+        for choice in sorted(self.schema.choices, key=len, reverse=True):
+            if folded.startswith(choice.casefold()) and REMARK.match(line, len(choice)):
+                return Action(choice, text=choice)
+        return None
+
+
+def squeeze(text: str) -> str:
+    """`text` for comparison with a menu entry: without dress, case, and closing signs."""
+    return " ".join(DRESS.sub("", text).split()).strip(" \t`*_\"'.,;:!?").casefold()
+
+
+def first_line(text: str) -> str:
+    """The first line that is not empty."""
+    return next((line for line in text.splitlines() if line.strip()), "")

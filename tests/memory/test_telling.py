@@ -1,0 +1,31 @@
+"""How steps are told: what is cut, and what is not."""
+
+from __future__ import annotations
+
+from agentspec.memory import telling
+from tests.memory.one_step import step
+
+
+def test_a_step_is_told_with_its_thought_and_within_its_budget() -> None:
+    told = telling.told(step(0, "At the mill.", "GO(1)", thought="Thought: The key is there.\nAction: GO(1)"), 200, len)
+    assert told == "State: At the mill.\nThought: The key is there.\nAction: GO(1)\nResult: done"
+    short = telling.told(step(0, "x" * 500, "GO(1)", thought="why " * 100 + "\nAction: GO(1)", reward=2.0), 120, len)
+    assert len(short) <= 121 and short.endswith("Action: GO(1)\nResult: done\nReward: +2.00")
+    assert telling.thought_of(step(0, "s", "GO(1)", thought="GO(1)")) == ""
+
+
+def test_a_course_keeps_what_was_done_and_shares_the_rest_among_states() -> None:
+    steps = [["a" * 100, "1. GO -> ok"], ["", "2. TAKE -> no"], ["b" * 100, "3. WAIT -> ok"]]
+    # Lines and breaks: 12 + 14 + 14 = 40 of 100; 60 are left for two states: 29 and a break, then what the first left.
+    told = telling.course(steps, 100, len).splitlines()
+    assert [line for line in told if line[0] in "123"] == [line for _, line in steps]
+    assert [len(line) for line in told if line.startswith("State: ")] == [29, 29] and len("\n".join(told)) == 99
+    assert telling.course(steps, 45, len) == "1. GO -> ok\n2. TAKE -> no\n3. WAIT -> ok"  # no room to say anything
+    assert telling.course(steps, 20, len) == "1. GO -> ok\n2. T ..."
+    assert telling.course([["s", "1. GO -> ok"]], 40, len) == "State: s\n1. GO -> ok"
+
+
+def test_what_fits() -> None:
+    assert telling.newest_that_fit(["aaaa", "bb", "cc"], 6, len) == ["bb", "cc"]
+    assert telling.newest_that_fit(["a" * 10], 8, len) == ["aaaa ..."]
+    assert telling.within(["aa", "bb", "c"], 6, len) == ["aa", "bb"]

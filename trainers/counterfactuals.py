@@ -1,0 +1,267 @@
+"""Episodes beside the batch that say what a write to memory was worth: played, recorded, told apart.
+
+A re-roll begins in exactly the state in which the write was asked for. That state is reached by playing the episode
+again: every answer before the write is the recorded one, and an episode repeats (`agentspec.episode`), so that the
+environment, the memory, the conversation and the reasoner are what they were, whether or not they can be restored
+from a snapshot. The write itself is then either the recorded answer, or withheld: the module is told that no answer
+came, and does what it does then. From there on the policy samples anew; re-rolls of one number sample with the same
+seeds with and without the write, so that a write which no prompt shows earns exactly nothing.
+
+Records carry their plan in their metrics (`counterfactual/...`) and lie in the run's folder `counterfactuals`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from agentspec.episode import Job, Runner
+from agentspec.llm.base import LLM, ContextOverflowError, LLMError, Message, Request
+from agentspec.llm.none import NoLLM
+from agentspec.llm.recorder import derive_seed
+from agentspec.spec import ModuleSpec
+from agentspec.trajectory import Trajectory
+from agentspec.types import LLMCall
+from rewards.base import NonFiniteRewardError
+from trainers.credit import CreditRule, ScoredEpisode
+from trainers.writes import EVERY, Plan
+
+FOLDER = "counterfactuals"
+"""Folder of a run that holds them, one file per generation round."""
+
+STEP, KEPT, NUMBER = (f"counterfactual/{name}" for name in ("step", "kept", "number"))
+
+Key = tuple[int, str, str]
+"""Step, path and branch of a call; several of one key are told apart by their order."""
+
+
+class WithheldError(ContextOverflowError):
+    """The answer is withheld; a module treats it as a prompt that does not fit: a counted no-op."""
+
+
+@dataclass
+class Replayed:
+    """A backend that gives the recorded answers up to a write, then the write or nothing, then the live model's.
+
+    Args:
+        llm: the live model.
+        recorded: the episode.
+        plan: which of its writes, and whether it is made.
+        is_write: path of a call -> whether it writes.
+    """
+
+    llm: LLM
+    recorded: Trajectory
+    plan: Plan
+    is_write: Callable[[str], bool]
+    _given: dict[Key, list[LLMCall]] = field(default_factory=lambda: defaultdict(list), repr=False)
+    _asked: Counter[Key] = field(default_factory=Counter, repr=False)
+
+    def __post_init__(self) -> None:
+        self.name = self.llm.name
+        self.capabilities = self.llm.capabilities
+        self.max_context = self.llm.max_context
+        for call in prefix(self.recorded, self.plan, self.is_write):
+            self._given[_key(call)].append(call)
+
+    async def generate(self, request: Request) -> LLMCall:
+        """The recorded answer, the live one, or none.
+
+        Raises:
+            WithheldError: it is the write, and it is withheld.
+        """
+        key = _key(request)
+        number = self._asked[key]
+        self._asked[key] += 1
+        if number < len(self._given[key]):
+            return replace(self._given[key][number], id=request.id)
+        if request.tag.step == self.plan.step and self.is_write(request.tag.path) and not self.plan.kept:
+            raise WithheldError(f"{request.tag.path} of step {request.tag.step} is withheld")
+        if request.tag.step < self.plan.step:
+            raise LLMError(f"{request.tag.path} of step {request.tag.step} was not asked when the episode was recorded")
+        seed = derive_seed(self.recorded.seed, "reroll", self.plan.number, *key, number)
+        live = replace(request, seed=seed, tag=replace(request.tag, episode=self._name(request.tag.episode)))
+        return replace(await self.llm.generate(live), tag=request.tag)
+
+    async def score(
+        self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
+    ) -> tuple[float, ...]:
+        """As the live model scores."""
+        return await self.llm.score(messages, continuations, episode=self._name(episode))
+
+    def count_tokens(self, text: str) -> int:
+        """As the live model counts."""
+        return self.llm.count_tokens(text)
+
+    def enter(self, episode: str) -> None:
+        """Goes live under a name of its own: the episode's other re-rolls play beside it."""
+        self.llm.enter(self._name(episode))
+
+    def leave(self, episode: str) -> None:
+        """Its own name ends."""
+        self.llm.leave(self._name(episode))
+
+    def _name(self, episode: str) -> str:
+        plan = self.plan
+        return f"{episode}~{plan.step}{'with' if plan.kept else 'without'}{plan.number}" if episode else ""
+
+
+def _key(of: LLMCall | Request) -> Key:
+    return of.tag.step, of.tag.path, of.tag.branch
+
+
+def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) -> list[LLMCall]:
+    """The recorded calls that a re-roll repeats: all before the write, and the write where it is kept."""
+    writes = [c.id for c in trajectory.calls if c.tag.step == plan.step and is_write(c.tag.path)]
+    first = min(writes, default=-1)
+    kept = set(writes) if plan.kept else set()
+    return [c for c in trajectory.calls if c.id < first or c.id in kept]
+
+
+def play_beside(
+    runner: Runner, jobs: Sequence[Job], episodes: Sequence[ScoredEpisode], rule: CreditRule, *, retries: int = 0
+) -> list[ScoredEpisode]:
+    """The episodes with their counterfactuals, as the rule wants them.
+
+    Args:
+        runner: what played the episodes.
+        jobs: of the episodes, in order.
+        episodes: in order.
+        rule: which counterfactuals, and how they are scored.
+        retries: as of `trainers.rollouts.collect`: a repeated episode had another seed.
+    """
+    wanted = [
+        (i, plan, _job(job, episode.trajectory, retries))
+        for i, (job, episode) in enumerate(zip(jobs, episodes, strict=True))
+        for plan in rule.writes.plan(episode.trajectory, rule.train)
+    ]
+    if not wanted:
+        return list(episodes)
+    played = asyncio.run(_play_all(runner, [(episodes[i].trajectory, p, j) for i, p, j in wanted], rule))
+    return attach(episodes, played, rule)
+
+
+def _job(job: Job, trajectory: Trajectory, retries: int) -> Job:
+    """The job as it was played at last: a failed one was played again with a run seed of its own."""
+    seeds = [job.run_seed, *(derive_seed(job.run_seed, "retry", n) for n in range(1, retries + 1))]
+    again = (replace(job, run_seed=seed) for seed in seeds)
+    return next((j for j in again if j.seed == trajectory.seed), job)
+
+
+async def _play_all(
+    runner: Runner, wanted: Sequence[tuple[Trajectory, Plan, Job]], rule: CreditRule
+) -> list[Trajectory]:
+    gate = asyncio.Semaphore(runner.concurrency or len(wanted))
+
+    async def play(recorded: Trajectory, plan: Plan, job: Job) -> Trajectory:
+        async with gate:
+            [trajectory] = await _runner(runner, recorded, plan, rule).run_async([job])
+        return settled(mark(trajectory, plan), recorded, plan, rule)
+
+    return list(await asyncio.gather(*(play(*one) for one in wanted)))
+
+
+def _runner(runner: Runner, recorded: Trajectory, plan: Plan, rule: CreditRule) -> Runner:
+    """What plays one counterfactual: the agent without memory, or the recorded beginning and then the policy."""
+    quiet = replace(runner, progress=None, on_done=None, on_step=None)
+    if plan.step == EVERY:
+        return replace(quiet, spec=replace(runner.spec, memory=ModuleSpec("none")))
+    return replace(quiet, llm=Replayed(runner.llm or NoLLM(), recorded, plan, rule.writes.is_write))
+
+
+def mark(trajectory: Trajectory, plan: Plan) -> Trajectory:
+    """The record, with its plan."""
+    marks = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
+    return replace(trajectory, metrics={**trajectory.metrics, **marks})
+
+
+def settled(trajectory: Trajectory, episode: Trajectory, plan: Plan, rule: CreditRule) -> Trajectory:
+    """The record; failed if it is not what was planned (a module that does not repeat), or earned what is no number."""
+    problems = list(differences(episode, trajectory, plan, rule))
+    try:
+        rule.score([trajectory])
+    except NonFiniteRewardError as error:
+        problems.append(f"not finite: {error}")
+    return replace(trajectory, status="failed", error="; ".join(problems)) if problems else trajectory
+
+
+def records(episodes: Sequence[ScoredEpisode]) -> list[Trajectory]:
+    """All counterfactuals of a round, in order."""
+    return [other.trajectory for episode in episodes for _, other in episode.beside]
+
+
+def attach(
+    episodes: Sequence[ScoredEpisode], beside: Sequence[Trajectory], rule: CreditRule, problems: list[str] | None = None
+) -> list[ScoredEpisode]:
+    """Give every episode those of its counterfactuals that the rule wants, scored.
+
+    Args:
+        episodes: in the order in which the counterfactuals were recorded.
+        beside: all of them, in order.
+        problems: where to say what is missing, left over or not what it claims (the audit's).
+
+    Raises:
+        ValueError: a counterfactual is missing, and nobody wants to be told.
+    """
+    found = iter(beside)
+    attached = []
+    for episode in episodes:
+        wanted = rule.writes.plan(episode.trajectory, rule.train)
+        records = rule.score([record for _, record in zip(wanted, found, strict=False)])
+        mine = list(zip(wanted, records, strict=False))
+        told = [w for plan, other in mine for w in differences(episode.trajectory, other.trajectory, plan, rule)]
+        if len(mine) < len(wanted):
+            told.append(f"{episode.trajectory.episode} has {len(mine)} counterfactuals, expected {len(wanted)}")
+        if told and problems is None:
+            raise ValueError("; ".join(told))
+        (problems if problems is not None else []).extend(told)
+        attached.append(replace(episode, beside=tuple(mine)))
+    left = len(list(found))
+    if left and problems is not None:
+        problems.append(f"{left} counterfactuals belong to no write")
+    return attached
+
+
+def differences(episode: Trajectory, other: Trajectory, plan: Plan, rule: CreditRule) -> Iterator[str]:
+    """What makes a record another thing than the counterfactual of `plan` of this episode (nothing: it is that)."""
+    where = f"counterfactual of step {plan.step} of {episode.episode}"
+    marks: Mapping[str, object] = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
+    if (other.task, other.rollout, other.seed) != (episode.task, episode.rollout, episode.seed):
+        yield f"{where}: it is of {other.episode}"
+    if other.policy != episode.policy:
+        yield f"{where}: it was played by policy {other.policy}"
+    if any(other.metrics.get(name) != value for name, value in marks.items()):
+        yield f"{where}: its plan is not {plan}"
+    if plan.step == EVERY and any(c.tag.module.startswith("memory.") for c in other.calls):
+        yield f"{where}: it has calls of memory"
+    if plan.step == EVERY or not other.scorable:
+        return
+    for name, ours, theirs in (
+        ("steps", _before(episode, plan.step), _before(other, plan.step)),
+        ("calls", _sampled(prefix(episode, plan, rule.writes.is_write)), _sampled(_first(other, episode, plan, rule))),
+    ):
+        if ours != theirs:
+            yield f"{where}: its {name} before the write are not those of the episode"
+    if not plan.kept and any(c.tag.step == plan.step and rule.writes.is_write(c.tag.path) for c in other.calls):
+        yield f"{where}: the write was to be withheld"
+
+
+def _before(trajectory: Trajectory, step: int) -> list[tuple[object, ...]]:
+    return [(t.input.text, t.action_text, t.reward) for t in trajectory.transitions[:step]]
+
+
+def _sampled(calls: Sequence[LLMCall]) -> list[tuple[object, ...]]:
+    return sorted((*_key(c), c.prompt_ids, tuple((x.token_ids, x.logprobs) for x in c.completions)) for c in calls)
+
+
+def _first(other: Trajectory, episode: Trajectory, plan: Plan, rule: CreditRule) -> list[LLMCall]:
+    """As many of a re-roll's calls as the episode's beginning has, key by key."""
+    left = Counter(_key(c) for c in prefix(episode, plan, rule.writes.is_write))
+    found = []
+    for call in sorted(other.calls, key=lambda c: c.id):
+        if left[_key(call)] > 0:
+            left[_key(call)] -= 1
+            found.append(call)
+    return found
