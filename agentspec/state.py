@@ -42,5 +42,5 @@ def _require_string_keys(data: Any) -> None:
                 if not isinstance(key, str):
                     kind = type(key).__name__
                     raise TypeError(f"state has the key {key!r} ({kind}); keys must be strings: use str(key)")
-            value = value.values()
-        containers += [inner for inner in value if isinstance(inner, _CONTAINERS)]
+        inside = value.values() if isinstance(value, dict) else value
+        containers += [inner for inner in inside if isinstance(inner, _CONTAINERS)]
