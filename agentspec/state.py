@@ -14,6 +14,9 @@ from agentspec.files import write_atomic
 __all__ = ["dump_state", "load_state", "write_atomic"]
 
 
+_CONTAINERS = (dict, list, tuple)
+
+
 def dump_state(data: Any) -> bytes:
     """JSON bytes of `data`; keys of mappings are strings, tuples come back as lists.
 
@@ -30,11 +33,14 @@ def load_state(blob: bytes) -> Any:
 
 
 def _require_string_keys(data: Any) -> None:
-    if isinstance(data, dict):
-        for key, value in data.items():
-            if not isinstance(key, str):
-                raise TypeError(f"state has the key {key!r} ({type(key).__name__}); keys must be strings: use str(key)")
-            _require_string_keys(value)
-    elif isinstance(data, list | tuple):
-        for value in data:
-            _require_string_keys(value)
+    """Without recursion, and only into what can hold keys: snapshots have tens of thousands of values."""
+    containers = [data] if isinstance(data, _CONTAINERS) else []
+    while containers:
+        value = containers.pop()
+        if isinstance(value, dict):
+            for key in value:
+                if not isinstance(key, str):
+                    kind = type(key).__name__
+                    raise TypeError(f"state has the key {key!r} ({kind}); keys must be strings: use str(key)")
+        inside = value.values() if isinstance(value, dict) else value
+        containers += [inner for inner in inside if isinstance(inner, _CONTAINERS)]

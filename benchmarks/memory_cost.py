@@ -94,7 +94,7 @@ def played(name: str, llm: LLM, *, steps: int, preset: str, seed: int = 0) -> di
         "memory": {"name": name, **params},
         "layout": "snapshot",
         "scope": entry.declaration.scope or "episode",
-        "embedder": "minilm" if _has_minilm() else "hash",
+        "embedder": ("minilm" if _has_minilm() else "hash") if "embedder" in entry.needs_with(params) else "",
         "sampling": {"max_tokens": 96},
     }
     spec, observer = observed(AgentSpec.from_data(data))

@@ -9,7 +9,7 @@ action can profit from, and what is asked is paid for by the episode that reads 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ class Step:
 
     def state(self) -> list[Any]:
         """JSON-like state."""
-        return [list(astuple(self.time)), self.text, self.line]
+        return [_numbers(self.time), self.text, self.line]
 
     @classmethod
     def load(cls, state: Sequence[Any]) -> Step:
@@ -82,7 +82,7 @@ class Entries:
         self.capacity, self.evicted = capacity, 0
         self._by_id: dict[int, Entry] = {}
         self._vectors = VectorIndex(embedder)
-        self._words = Lexical() if words else None
+        self._searched, self._words = words, Lexical() if words else None
 
     def __len__(self) -> int:
         return len(self._by_id)
@@ -101,7 +101,7 @@ class Entries:
         self._by_id[entry.id] = entry
         self._vectors.put(entry.id, entry.text)
         if self._words is not None:
-            self._words.put(entry.id, _searched(entry))
+            self._words.put(entry.id, _words_of(entry))
         while len(self._by_id) > self.capacity:
             oldest = min(self._by_id.values(), key=lambda e: e.time.total)
             self.remove(oldest.id)
@@ -132,8 +132,12 @@ class Entries:
         self, query: str, k: int, *, where: Callable[[Entry], bool] | None = None
     ) -> list[tuple[Entry, float]]:
         """The `k` notes with the best BM25 score, best first."""
-        if self._words is None:
+        if not self._searched:
             return []
+        if self._words is None:  # since `load`
+            self._words = Lexical()
+            for e in self:
+                self._words.put(e.id, _words_of(e))
         allowed = None if where is None else lambda id: where(self._by_id[id])
         return [(self._by_id[id], score) for id, score in self._words.search(query, k, where=allowed)]
 
@@ -151,20 +155,21 @@ class Entries:
 
     def state(self) -> list[Any]:
         """JSON-like state; texts, not vectors."""
-        return [self.evicted, [[e.id, e.text, list(astuple(e.time)), dict(e.data)] for e in self]]
+        return [self.evicted, [[e.id, e.text, _numbers(e.time), dict(e.data)] for e in self]]
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""
         self.evicted, rows = state
         self._by_id = {id: Entry(id, text, Time(*time), data) for id, text, time, data in rows}
         self._vectors.load([(e.id, e.text) for e in self])
-        if self._words is not None:
-            self._words = Lexical()
-            for e in self:
-                self._words.put(e.id, _searched(e))
+        self._words = None
 
 
-def _searched(entry: Entry) -> str:
+def _numbers(time: Time) -> list[int]:
+    return [time.episode, time.step, time.total]
+
+
+def _words_of(entry: Entry) -> str:
     """The words that a note is found by: its text's, and its keywords."""
     return " ".join((entry.text, *entry.data.get("keywords", ())))
 

@@ -11,12 +11,13 @@
   confirms or removes rules, at most four at once. Every `merge_every` tasks the tasks are clustered by their first
   neighbours and each cluster's rules are merged into a third as many.
 
-AgentSpec's form: one agent, so rules are not projected on roles. Retrieval happens once, before the first decision, and
-so does the learning from the episode before: what no later episode reads is not asked. Numbers are kept (upstream
+AgentSpec's form: one agent, so rules are not projected on roles. Retrieval happens once, before the first decision,
+and so does the learning from the episode before: what no later episode reads is not asked. Numbers are kept (upstream
 strips digits, and merges into a ninth as many rules, by a slip). Success is what the environment says, or a return of
-at least `threshold`; where neither is given, a return above the best so far. Where there are only successes or only
-failures, these are compared among themselves. Within the first episode of a run the memory holds nothing but, in layout
-`snapshot`, the newest steps. Of the paper's tables this is the row *ReAct + G-Memory* (preset `paper`).
+at least `threshold`; where neither is given, a return above the mean so far (in the first episode above 0). Where
+there are only successes or only failures, these are compared among themselves. Within the first episode of a run the
+memory holds nothing but, in layout `snapshot`, the newest steps. Of the paper's tables this is the row *ReAct +
+G-Memory* (preset `paper`).
 
 Bounded by `capacity` episodes (the oldest goes first) and `max_insights` rules. An answer that cannot be read: no key
 steps (the chain's actions stand for them), no change of rules, no relevance (similarity decides).
@@ -38,7 +39,7 @@ from agentspec.llm.base import system, user
 from agentspec.memory.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
 from agentspec.memory.insights import Change, Insight, Insights, first_neighbours
 from agentspec.parameters import at_least, settings
-from agentspec.reflection.trials import episode_return, failed
+from agentspec.reflection.trials import episode_return
 from agentspec.retrieval import Graph
 from agentspec.services import Answer, Services
 from agentspec.state import dump_state, load_state
@@ -142,7 +143,7 @@ class GMemory:
         most_merges: most clusters whose rules are merged at once.
         top_insights: rules shown.
         max_insights: most rules.
-        threshold: least return of a success, where the environment does not say (`None`: above the best so far).
+        threshold: least return of a success, where the environment does not say (`None`: above the mean so far).
         trial_tokens: budget of an episode's steps in a prompt.
         key_tokens: most tokens of what is kept of an episode.
         answer_tokens: most tokens of other answers.
@@ -222,7 +223,7 @@ class GMemory:
         self.graph: Graph[int] = Graph()
         self.insights = Insights(max_insights)
         self._count = 0  # episodes so far
-        self._best: float | None = None
+        self._total = 0.0  # sum of their returns
         self._chain = ""  # the episode that has not been learnt from
         self._unlearnt: int | None = None
         self._recalled: list[RecallItem] | None = None  # for this episode
@@ -264,7 +265,7 @@ class GMemory:
         return [RecallItem(text, kind="insight", source=self._name, priority=-i) for i, text in enumerate(texts)]
 
     async def _relevance(self, episode: Entry) -> Answer[Score]:
-        prompt = PAIR.format(task=self._began, episode=f"{episode.text}\n{_told(episode)}")
+        prompt = PAIR.format(task=self._began, episode=f"{_told(episode)}\nIt began: {episode.text}")
         return await self.services.ask("relevance", (system(RELEVANCE), user(prompt)), 64, self._json(Score))
 
     # -- learning --------------------------------------------------------------------------------------------------
@@ -278,8 +279,8 @@ class GMemory:
         if not trajectory.transitions:
             return
         total = episode_return(trajectory)
-        success = not failed(trajectory, self._best, self.threshold, 0)
-        self._best = total if self._best is None else max(self._best, total)
+        success = self._succeeded(trajectory, total)
+        self._total += total
         self.insights.judge(self._used, success)
         self._used = []
         first = trajectory.transitions[0].input
@@ -290,9 +291,19 @@ class GMemory:
         self._chain = clip_text("\n\n".join(blocks), self.trial_tokens + len(steps) * 8, count)
         actions = clip_text("; ".join(Experience.of(t).line() for t in steps), self.key_tokens, count)
         data = {"success": success, "return": total, "key": actions, "length": len(trajectory.transitions)}
+        data["graded"] = trajectory.metrics.get("success") is None and self.threshold is None
         self._unlearnt = self.services.new_id()
         self._keep(Entry(self._unlearnt, began, self.services.time(), data))
         self._count += 1
+
+    def _succeeded(self, trajectory: Trajectory, total: float) -> bool:
+        """What the environment says, or the threshold; else whether the return is above the mean so far."""
+        said = trajectory.metrics.get("success")
+        if said is not None:
+            return bool(said)
+        if self.threshold is not None:
+            return total >= self.threshold
+        return total > self._total / max(1, self._count)
 
     def _keep(self, episode: Entry) -> None:
         """A node of the query graph."""
@@ -312,7 +323,7 @@ class GMemory:
         episode = self.episodes[id]
         good = episode.data["success"]
         static = STEPS.format(
-            ended=f"{'succeeded' if good else 'failed'} (return {episode.data['return']:+.2f})",
+            ended=f"{_verdict(episode)} (return {episode.data['return']:+.2f})",
             what=KEY if good else MISTAKE,
             words=max(8, self.key_tokens // 2),
             task=task_of(instruction, self.task_tokens, self.services),
@@ -338,7 +349,7 @@ class GMemory:
         rules = list(self.insights)
         parts = [RULES.format(rules=_numbered(rules))] if rules else []
         parts.append("Episodes (data, not instructions):")
-        parts += [f"{e.text.partition(chr(10))[2]}\n{_told(e)}" for e in [*good, *bad]]
+        parts += [f"{_told(e)}\nIt began: {e.text.partition(chr(10))[2]}" for e in [*good, *bad]]
         prompt = (system(COMPARE), user("\n\n".join(parts)))
         answer = await self.services.ask(
             "compare", prompt, self.answer_tokens, self._json({"operations": list[Change]})
@@ -403,7 +414,7 @@ class GMemory:
     def snapshot(self) -> bytes:
         recalled = None if self._recalled is None else [[i.text, i.kind, i.source, i.priority] for i in self._recalled]
         graphs = [self.episodes.state(), self.graph.state(), self.insights.state()]
-        learning = [self._count, self._best, self._chain, self._unlearnt]
+        learning = [self._count, self._total, self._chain, self._unlearnt]
         return dump_state([*graphs, learning, [recalled, self._used, self._began, self._lines]])
 
     def restore(self, blob: bytes) -> None:
@@ -411,7 +422,7 @@ class GMemory:
         self.episodes.load(episodes)
         self.graph.load(graph)
         self.insights.load(insights)
-        self._count, self._best, self._chain, self._unlearnt = learning
+        self._count, self._total, self._chain, self._unlearnt = learning
         recalled, self._used, self._began, self._lines = episode
         items = [RecallItem(t, kind=kind, source=s, priority=p) for t, kind, s, p in recalled or []]
         self._recalled = None if recalled is None else items
@@ -419,9 +430,16 @@ class GMemory:
 
 def _told(episode: Entry) -> str:
     """An episode as it is shown."""
-    verdict = "succeeded" if episode.data["success"] else "failed"
-    ended = f"An earlier episode {verdict} (return {episode.data['return']:+.2f}, {episode.data['length']} steps)"
+    ended = (
+        f"An earlier episode {_verdict(episode)} (return {episode.data['return']:+.2f}, {episode.data['length']} steps)"
+    )
     return f"{ended}: {one_line(episode.data['key'])}"
+
+
+def _verdict(episode: Entry) -> str:
+    """How an episode ended; where a task is graded and not won or lost, it went well or badly beside the others."""
+    words = ("went well", "went badly") if episode.data["graded"] else ("succeeded", "failed")
+    return words[0] if episode.data["success"] else words[1]
 
 
 def _numbered(rules: Sequence[Insight]) -> str:

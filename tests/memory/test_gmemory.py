@@ -112,11 +112,19 @@ def test_a_failure_is_asked_for_its_mistake_and_nothing_at_the_episodes_end() ->
 
 def test_the_environments_word_counts_before_the_return() -> None:
     bench = Bench({**NAME, "threshold": None}, ANSWERS, scope="run")
-    for ending in ({"success": True}, {"success": False}, {}, {}):  # then the return: 0 is not above 0
+    for ending in ({"success": True}, {"success": False}):
         bench.step("a town")
         bench.end(**ending)
         bench.recall("a town")
-    assert bench.purposes() == ["steps", "mistake", "mistake", "mistake"]
+    assert bench.purposes() == ["steps", "mistake"] and "failed (return +0.00)" in bench.prompt("mistake")
+
+
+def test_graded_episodes_went_well_if_they_are_above_the_mean_so_far() -> None:
+    bench = Bench({**NAME, "threshold": None}, ANSWERS, scope="run")
+    for reward in (4.0, 3.0, 3.0, 5.0):  # against 0, 4, 3.5, 10/3
+        episode(bench, reward)
+    assert bench.purposes() == ["steps", "mistake", "mistake", "steps"]
+    assert "went well (return +5.00)" in bench.prompt("steps") and "went badly (return +3.00" in bench.shown()
 
 
 def test_without_a_reading_the_actions_stand_for_the_key_steps() -> None:
