@@ -291,10 +291,10 @@ def with_growth(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def methods(names: Sequence[str] = ()) -> dict[str, Mapping[str, Mapping[str, Any]]]:
-    """Method -> its presets; all that are registered, those that work in one environment only left out."""
+    """Method -> its presets; all that are registered."""
     found: dict[str, Mapping[str, Mapping[str, Any]]] = {}
     for name, entry in REGISTRY.all("memory").items():
-        if (not names and name not in NOT_MEMORIES and not entry.envs) or name in names:
+        if (not names and name not in NOT_MEMORIES) or name in names:
             found[name] = {preset: {"preset": preset} for preset in entry.presets} or {"": {}}
     for name in set(names) - set(found) - set(LIBRARIES):
         entry = REGISTRY.get("memory", name)  # an alias, or an error with the nearest names

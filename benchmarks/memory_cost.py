@@ -229,7 +229,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from agentspec.policies import Policy
 
     llm = Policy.parse(arguments.model).build()
-    wanted = arguments.methods or [n for n, e in REGISTRY.all("memory").items() if not e.envs]
+    wanted = arguments.methods or list(REGISTRY.all("memory"))
     rows: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys([BASELINE, *wanted]):
         rows[name] = played(name, llm, steps=arguments.steps, preset=arguments.preset)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.steps import FEEDBACK_TOKENS, first_held, step_name
+from agentspec.memory.parts.steps import FEEDBACK_TOKENS, first_held, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical

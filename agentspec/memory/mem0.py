@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory.entries import (
+from agentspec.memory.parts.entries import (
     NOTES,
     STEPS,
     Entries,

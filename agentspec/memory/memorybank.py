@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.steps import DATA, first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, first_held, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError

@@ -35,7 +35,7 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory.entries import (
+from agentspec.memory.parts.entries import (
     NOTES,
     STEPS,
     Entries,

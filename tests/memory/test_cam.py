@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agentspec.memory.entries import Entry
-from agentspec.memory.hierarchy import Level, affinity
+from agentspec.memory.cam.hierarchy import Level, affinity
+from agentspec.memory.parts.entries import Entry
 from agentspec.registry import SpecError
 from agentspec.retrieval import ego_split, label_propagation, replica_graph
 from agentspec.services import Time

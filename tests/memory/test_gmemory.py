@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agentspec.memory.insights import Change, Insight, Insights, first_neighbours
+from agentspec.memory.gmemory.insights import Change, Insight, Insights, first_neighbours
 from agentspec.registry import SpecError
 from tests.memory.bench import Bench, Rows
 from tests.memory.recall_world import succeeds

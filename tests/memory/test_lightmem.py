@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agentspec.memory.compression import WordCounts, boundaries, keep_surprising
+from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising
 from agentspec.registry import REGISTRY, SpecError
 from tests.memory.bench import Bench, Rows
 from tests.memory.recall_world import notes, succeeds

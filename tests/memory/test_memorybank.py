@@ -119,7 +119,7 @@ def test_a_bad_answer_writes_nothing_and_is_counted(answer: str) -> None:
 
 
 def test_a_summary_that_was_cut_off_keeps_its_whole_sentences() -> None:
-    from agentspec.memory.steps import written
+    from agentspec.memory.parts.steps import written
     from agentspec.services import Answer
 
     cut = Answer("The box is at 5m. It was taken. The next", problem="truncated")

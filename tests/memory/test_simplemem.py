@@ -100,7 +100,7 @@ def test_the_depth_grows_with_the_complexity_of_the_query() -> None:
 
 
 def test_affinity_is_likeness_in_meaning_and_in_time() -> None:
-    from agentspec.memory.entries import Entry
+    from agentspec.memory.parts.entries import Entry
 
     memory = Bench({**NAME, "beta": 0.7, "decay": 0.02}).memory
     a, b = Entry(0, "a", Time(0, 0, 0)), Entry(1, "b", Time(0, 50, 50))

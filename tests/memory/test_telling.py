@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agentspec.memory import telling
+from agentspec.memory.parts import telling
 from tests.memory.one_step import step
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agentspec.embedding import HashEmbedder
-from agentspec.memory.temporal import TemporalGraph, holds
+from agentspec.memory.zep.temporal import TemporalGraph, holds
 from agentspec.registry import SpecError
 from agentspec.retrieval import Graph, label_propagation
 from agentspec.services import Time

@@ -24,10 +24,10 @@ from typing import Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory import telling
 from agentspec.memory.ace import prompts
 from agentspec.memory.ace.playbook import SECTIONS, Bullet, Operation, Playbook, operations_of
 from agentspec.memory.ace.records import Counts, Review, Waiting
+from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError

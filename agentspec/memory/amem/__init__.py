@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory import telling
 from agentspec.memory.amem import prompts
 from agentspec.memory.amem.notes import Analysis, Evolution, Note, id_of, words
+from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex

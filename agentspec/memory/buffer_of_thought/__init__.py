@@ -31,9 +31,9 @@ from dataclasses import asdict, replace
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
-from agentspec.memory import telling
 from agentspec.memory.buffer_of_thought import prompts
 from agentspec.memory.buffer_of_thought.templates import COARSE, Template
+from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError

@@ -31,8 +31,8 @@ import numpy as np
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory import telling
 from agentspec.memory.dynamic_cheatsheet import prompts
+from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex, top_rows

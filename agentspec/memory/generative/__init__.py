@@ -25,9 +25,9 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
-from agentspec.memory import telling
 from agentspec.memory.generative import prompts
 from agentspec.memory.generative.stream import Memory, Stream, Weights
+from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError

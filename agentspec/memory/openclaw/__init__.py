@@ -25,7 +25,7 @@ from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.openclaw.files import FileTree, Skill, one_line, rule_name, rules_of, rules_text, skills_in, slug
 from agentspec.memory.openclaw.prompts import DREAM, FLUSH, HEAD, LEARN, NOTHING
 from agentspec.memory.openclaw.search import Chunk, decay, dream_score, hybrid, kept_share
-from agentspec.memory.steps import first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import first_held, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError

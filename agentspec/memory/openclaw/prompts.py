@@ -1,6 +1,6 @@
 """What OpenClaw's memory asks the model. The static part stands first, the request last."""
 
-from agentspec.memory.steps import DATA
+from agentspec.memory.parts.steps import DATA
 
 HEAD = (
     "You keep the notes of an agent that acts in an environment.\n\n"

@@ -6,7 +6,7 @@
   `edge`. For a new episode the nearest ones and their neighbours (`hops`) are the related tasks; of `2 * successes`
   candidates with cosine at least `least` the ones that the model finds most relevant (1 to 10) are shown, with the
   nearest failures.
-- *Insight*: rules with a score and the tasks that support them (see `agentspec.memory.insights`). Every `every` tasks,
+- *Insight*: rules with a score and the tasks that support them (see `insights`). Every `every` tasks,
   `comparisons` times, a task is drawn and the model compares its nearest successes with a failure, and adds, edits,
   confirms or removes rules, at most four at once. Every `merge_every` tasks the tasks are clustered by their first
   neighbours and each cluster's rules are merged into a third as many.
@@ -36,8 +36,8 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
-from agentspec.memory.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
-from agentspec.memory.insights import Change, Insight, Insights, first_neighbours
+from agentspec.memory.gmemory.insights import Change, Insight, Insights, first_neighbours
+from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
 from agentspec.parameters import at_least, settings
 from agentspec.reflection.trials import episode_return
 from agentspec.retrieval import Graph

@@ -37,8 +37,8 @@ from typing import Any
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
-from agentspec.memory.compression import WordCounts, boundaries, keep_surprising
-from agentspec.memory.entries import (
+from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising
+from agentspec.memory.parts.entries import (
     STEPS,
     Entries,
     Entry,

@@ -5,7 +5,7 @@ when it ended, and when that was written. A write is at most three calls: one ex
 together (with the `context` steps before, to understand the new ones); one says which new names mean known entities,
 and is made only where names are alike and not equal; one says which facts repeat or contradict earlier ones about the
 same things, and is made only where there are such. Code does the rest: what is contradicted is not deleted but ends
-where the other begins (see `agentspec.memory.temporal`), in whatever order they are told.
+where the other begins (see `agentspec.memory.zep.temporal`), in whatever order they are told.
 
 Retrieval looks facts up by meaning, by words, and along the graph (`hops`) from what the observation names, fuses the
 three rankings by reciprocal rank (constant 0, as Graphiti does), and shows each with its times. Communities of entities
@@ -36,7 +36,7 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory.entries import (
+from agentspec.memory.parts.entries import (
     NOTES,
     STEPS,
     Entry,
@@ -49,7 +49,7 @@ from agentspec.memory.entries import (
     task_of,
     told,
 )
-from agentspec.memory.temporal import TemporalGraph, normal
+from agentspec.memory.zep.temporal import TemporalGraph, normal
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.retrieval import label_propagation
 from agentspec.services import Services, Time

@@ -3,7 +3,7 @@
 - *Assimilate.* Every step is a node, linked to those of its `links` nearest nodes with which its affinity
   (`alpha * cosine + (1 - alpha) * exp(-distance² / 2 sigma²)`, distance in steps) is at least `theta`.
 - *Accommodate.* Nodes are split by their neighbourhoods and labels spread over the replicas (see
-  `agentspec.memory.hierarchy`), only where something has changed. One call sums up each cluster that has changed; the
+  `hierarchy`), only where something has changed. One call sums up each cluster that has changed; the
   summary is a node one level up, linked to those whose clusters overlap or touch its own; and so on for `levels`
   levels.
 - *Read.* The `seeds` nodes most similar to the observation, of all levels, are the first candidates. With `read:
@@ -29,7 +29,8 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
-from agentspec.memory.entries import (
+from agentspec.memory.cam.hierarchy import Level, affinity
+from agentspec.memory.parts.entries import (
     NOTES,
     Entries,
     Entry,
@@ -41,7 +42,6 @@ from agentspec.memory.entries import (
     stamp,
     task_of,
 )
-from agentspec.memory.hierarchy import Level, affinity
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Answer, Services
 from agentspec.state import dump_state, load_state

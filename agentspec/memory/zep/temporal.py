@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from agentspec.memory.entries import Entries, Entry
+from agentspec.memory.parts.entries import Entries, Entry
 from agentspec.protocols import Embedder
 from agentspec.retrieval import Graph, mmr, reciprocal_rank_fusion
 from agentspec.services import Time
