@@ -225,7 +225,7 @@ class Mem0Memory:
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """The nearest memories; first what an earlier episode left is written."""
-        if self._left:
+        if self._left and self._pending:
             self._left = False
             await self._write(input.instruction)
         now = self.services.time()

@@ -252,7 +252,7 @@ class SimpleMemory:
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """The notes that score best; what an earlier episode left is written first."""
-        if self._left:
+        if self._left and self._new:
             self._left = False
             await self._compress(input.instruction)
         now = self.services.time()

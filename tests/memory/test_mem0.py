@@ -137,3 +137,10 @@ def test_mem0_recalls_what_a_short_window_has_lost() -> None:
     keep = {"update": lambda request: json.dumps(add_all(request))}
     assert not succeeds({"name": "base", "window": 5})
     assert succeeds(memory, curate=keep) and succeeds(memory, scope="run", curate=keep)
+
+
+def test_nothing_is_asked_when_an_earlier_episode_left_nothing_after_all() -> None:
+    bench = Bench(ONE, {"extract": [{"facts": ["The key is red."]}]})
+    bench.memory._left = True  # steps were left, and written since, before anything was recalled
+    bench.recall("a key")
+    assert bench.purposes() == []

@@ -190,7 +190,7 @@ class CamMemory:
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """What the model picks, or what is most similar; what an earlier episode left grows first."""
-        if self._left:
+        if self._left and self._pending:
             self._left = False
             await self._grow(input.instruction)
         found = await self._pick(input.text, k) if self.read == "model" and len(self.nodes) else None
