@@ -24,7 +24,7 @@ def add_environment(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--env", default="deliverybench", help="registered name or gymnasium id (default: %(default)s)")
     group.add_argument("--map", metavar="DIR", help="folder of a city map (default: a generated city)")
     group.add_argument("--shift-hours", type=float, metavar="H", help="length of the shift, in simulated hours")
-    group.add_argument("--observation", metavar="NAME", help="how much the observation says: compact, or the world's own")
+    group.add_argument("--observation", metavar="NAME", help="compact, or another of the world's texts")
     group.add_argument("--action-mode", choices=("native", "menu"), help="write action calls, or choose from a menu")
     group.add_argument(
         "--option",
