@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 ENTRY_POINTS = {
     "agentspec/DeliveryBench-v0": "agentspec.envs.deliverybench.env:DeliveryBenchEnv",
     "agentspec/MiniGrid-v0": "agentspec.envs.minigrid.env:MiniGridEnv",
+    "agentspec/Alfred-v0": "agentspec.envs.alfred.env:AlfredEnv",
+    "agentspec/RoboThor-v0": "agentspec.envs.robothor.env:RoboThorEnv",
 }
 """Environment id -> where its class is; the class is imported only when the environment is made."""
 
@@ -78,4 +80,16 @@ register(
     "minigrid",
     "agentspec/MiniGrid-v0",
     "MiniGrid and BabyAI grids: egocentric text, success within 100 steps, the paper's ten tasks",
+)
+register(
+    "env",
+    "alfred",
+    "agentspec/Alfred-v0",
+    "ALFRED household tasks: find, carry, heat, cool, clean, slice, within 200 steps",
+)
+register(
+    "env",
+    "robothor",
+    "agentspec/RoboThor-v0",
+    "RoboTHOR object navigation: find an object of a class in an apartment and stop, within 200 steps",
 )

@@ -189,11 +189,15 @@ class OfflineThor:
         targets = [b for b in self.state.bodies.values() if wanted in (b.id, b.type)]
         return frozenset(c for c in self.scene.cells if any(self._seen_from(c, b) for b in targets))
 
-    def _seen_from(self, cell: Cell, one: Body) -> bool:
+    def near(self, cell: Cell, one: Body) -> bool:
+        """Whether an object is within reach of a cell (as far as its box goes; it may be hidden)."""
         low, high = one.low, one.high
         x, z = cell[0] * GRID, cell[1] * GRID
         dx, dz = max(low[0] - x, 0.0, x - high[0]), max(low[2] - z, 0.0, z - high[2])
-        return math.hypot(dx, dz) <= self.settings.visibility and self.sight.free(one, x, z)
+        return math.hypot(dx, dz) <= self.settings.visibility
+
+    def _seen_from(self, cell: Cell, one: Body) -> bool:
+        return self.near(cell, one) and self.sight.free(one, cell[0] * GRID, cell[1] * GRID)
 
     # -- reporting ---------------------------------------------------------------------------------------------
 

@@ -102,6 +102,16 @@ class Sight:
             seen[i] |= one.held
         return seen
 
+    def sees(self, one: Body, agent: Agent) -> bool:
+        """Whether one object would be visible to the agent at a pose."""
+        k = next(i for i, b in enumerate(self._bodies) if b.id == one.id)
+        if one.held or self._hidden[k]:
+            return bool(one.held)
+        eye, turn = self.camera.eye(agent), self.camera.turn(agent)
+        which = np.array([k])
+        nearest = np.clip(eye, self._low, self._high)
+        return bool(self._in_picture(which, nearest, eye, turn, agent)[0])
+
     def _in_picture(self, which: npt.NDArray[np.intp], nearest: Floats, eye: Floats, turn: Floats, agent: Agent) -> Floats:
         low, high = self._low[which], self._high[which]
         grid = ((low + high) / 2)[:, None] + _GRID * (high - low)[:, None]
