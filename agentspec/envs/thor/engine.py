@@ -7,6 +7,7 @@ what is done to objects in `manipulation`, what is seen in `sight`, pictures in 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -103,6 +104,11 @@ class OfflineThor:
         except (KeyError, TypeError, ValueError) as error:
             self._last = (name, False, f"{name} has missing or malformed fields ({error!r})", None)
         return self.observe()
+
+    def try_move(self, name: str) -> None:
+        """A move or turn without an event, for searches; one that is blocked changes nothing."""
+        with contextlib.suppress(Refused):
+            self._act(name, {})
 
     def _act(self, name: str, action: Mapping[str, Any]) -> Any:
         if name in MOVES:
