@@ -34,7 +34,7 @@ VALIDATION: tuple[str, ...] = (
 """The fixed ten, from 1.0 m to 7.6 m."""
 
 OWN: tuple[tuple[str, Cell, int], ...] = (
-    ("Television", (7, 9), 180),
+    ("Television", (7, 4), 180),
     ("Vase", (10, 4), 90),
     ("AlarmClock", (18, 5), 180),
     ("GarbageCan", (16, 9), 270),

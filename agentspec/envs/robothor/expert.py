@@ -17,8 +17,8 @@ Pose = tuple[float, float, float]
 
 
 def _key(pose: Pose) -> tuple[Any, ...]:
-    """Poses of one cell and heading count as one: turns of 30 degrees leave the grid."""
-    return (cell_at(pose[0], pose[1]), round(pose[2]))
+    """Poses within 12 cm and of one heading count as one: turns of 30 degrees leave the grid."""
+    return (round(8 * pose[0]), round(8 * pose[1]), round(pose[2]))
 
 
 class Oracle:
