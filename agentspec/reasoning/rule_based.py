@@ -39,7 +39,7 @@ class RuleBased(Stateless):
 
     declaration = Declaration(
         "the environment's scripted expert: no model, a baseline and demonstrator",
-        envs=("deliverybench", "minigrid"),
+        envs=("deliverybench", "minigrid", "alfred", "robothor"),
         aliases=("simple",),
     )
 
@@ -82,7 +82,7 @@ class RandomLegal(Stateless):
 
     declaration = Declaration(
         "a random sensible action: no model, the floor",
-        envs=("deliverybench", "minigrid"),
+        envs=("deliverybench", "minigrid", "alfred", "robothor"),
         name="random",
     )
 

@@ -195,7 +195,9 @@ class AlfredEnv(Game):
         if self._schema_now.choices:
             lines.append("You can: " + "; ".join(self._schema_now.choices))
         stop = "It ends when the task is done." if self._end_on_success else ""
-        rules = RULES.format(steps=self.max_steps, stop=stop or "Say STOP() when it is done.", task=self.trial.instruction)
+        rules = RULES.format(
+            steps=self.max_steps, stop=stop or "Say STOP() when it is done.", task=self.trial.instruction
+        )
         return {
             "instruction": rules,
             "text": "\n".join(lines),

@@ -146,4 +146,4 @@ CONDITIONS: dict[str, Callable[..., tuple[int, int]]] = {
     "look_at_obj_in_light": _light,
     "pick_and_place_with_movable_recep": _movable,
 }
-"""Task type -> its conditions (without slicing): wanted objects, receptacles, targets, metadata, changes -> met, total."""
+"""Task type -> its conditions, slicing aside: wanted, receptacles, targets, metadata, changes -> met, total."""

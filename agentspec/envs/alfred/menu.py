@@ -156,7 +156,9 @@ def _go(env: AlfredEnv, name: str) -> tuple[str, str, str]:
         way, name = None, f"{name} ({refusal})"
     if not way:
         env.act({"action": "Pass"})
-        return ("", f"there is no way to see {name} from here", "no_way") if way is None else (f"{name} is here", "", "")
+        return (
+            ("", f"there is no way to see {name} from here", "no_way") if way is None else (f"{name} is here", "", "")
+        )
     left = env.left
     for command in way[:left]:
         env.act({"action": command})

@@ -119,20 +119,10 @@ class OfflineThor:
             return None
         if name in LOOKS:
             return self._look(LOOKS[name] * float(action.get("degrees") or self.settings.look_step))
-        if name in manipulation.ACTIONS:
-            return manipulation.ACTIONS[name](self, action)
-        if name in setup.ACTIONS:
-            return setup.ACTIONS[name](self, action)
-        if name == "GetShortestPath":
-            return self._shortest_path(action)
-        if name == "GetReachablePositions":
-            return [self._point(cell) for cell in sorted(self.scene.cells)]
-        if name == "GetScenesInBuild":
-            return [self.scene.name]
-        if name == "Reset":
-            return self._reset(str(action.get("sceneName") or self.scene.name))
-        if name in NOTHING:
-            return None
+        if name in CHANGING:
+            return CHANGING[name](self, action)
+        if name in ASKING:
+            return ASKING[name](self, action)
         raise Refused(f"there is no action {name!r}")
 
     def _move(self, turn: float, metres: float) -> None:
@@ -260,3 +250,14 @@ class OfflineThor:
         self._last = tuple(data["last"])
         self.touched()
         return self.observe()
+
+
+CHANGING: Mapping[str, Callable[[OfflineThor, Mapping[str, Any]], None]] = {**manipulation.ACTIONS, **setup.ACTIONS}
+ASKING: Mapping[str, Callable[[OfflineThor, Mapping[str, Any]], Any]] = {
+    "GetShortestPath": OfflineThor._shortest_path,
+    "GetReachablePositions": lambda world, action: [world._point(cell) for cell in sorted(world.scene.cells)],
+    "GetScenesInBuild": lambda world, action: [world.scene.name],
+    "Reset": lambda world, action: world._reset(str(action.get("sceneName") or world.scene.name)),
+    **dict.fromkeys(NOTHING, lambda world, action: None),
+}
+"""Action -> what answers it; the answer is the event's `actionReturn`."""

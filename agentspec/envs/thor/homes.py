@@ -112,9 +112,14 @@ def _box(row: Row) -> Thing:
 
 
 def free_cells(
-    west: float, south: float, east: float, north: float, things: Iterable[Thing], walls: Iterable[tuple[Vector, Vector]]
+    west: float,
+    south: float,
+    east: float,
+    north: float,
+    things: Iterable[Thing],
+    walls: Iterable[tuple[Vector, Vector]],
 ) -> frozenset[Cell]:
-    """The cells of a rectangle (metres) at which a disc of `RADIUS` meets no box; the largest connected part of them."""
+    """The cells of a rectangle at which a disc of `RADIUS` meets no box: the largest connected part of them."""
     boxes = [(t.centre, t.size) for t in things if "pickupable" not in kind(t.type).abilities or t.centre[1] < 0.6]
     boxes += list(walls)
     low = [(c[1] - s[1] / 2) for c, s in boxes]

@@ -1,4 +1,4 @@
-"""What can be done to objects: pick up, put, open, close, switch, slice. Each fails with a message, or changes the state.
+"""What can be done to objects: pick up, put, open, close, switch, slice; it fails with a message, or is done.
 
 Every action needs its object in view (`forceAction` or `forceVisible` wave no such rule here: recorded plans that set
 them do what they do in view).

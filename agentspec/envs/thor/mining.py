@@ -20,6 +20,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,9 @@ def _aliases(things: list[Thing], ids: set[str]) -> tuple[list[Thing], dict[str,
     return [*fixed, *added], {new: old for new, old in renamed.items()}
 
 
-ADDABLE = frozenset({"DeskLamp", "Faucet", "CoffeeMachine", "FloorLamp", "Laptop", "Television", "Safe", "LaundryHamper"})
+ADDABLE = frozenset(
+    {"DeskLamp", "Faucet", "CoffeeMachine", "FloorLamp", "Laptop", "Television", "Safe", "LaundryHamper"}
+)
 """Furniture that one build has and another lacks, and that plans use."""
 
 
@@ -206,7 +209,7 @@ def path_cells(path: Iterable[Mapping[str, float]]) -> set[Cell]:
     """The cells under a polyline of positions (looked at every 5 cm)."""
     points = [(p["x"], p["z"]) for p in path]
     cells = set()
-    for (ax, az), (bx, bz) in zip(points, points[1:], strict=False):
+    for (ax, az), (bx, bz) in pairwise(points):
         n = max(1, int(math.hypot(bx - ax, bz - az) / (GRID / 5)))
         cells |= {cell_at(ax + (bx - ax) * i / n, az + (bz - az) * i / n) for i in range(n + 1)}
     return cells

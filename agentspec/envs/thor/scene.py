@@ -81,7 +81,7 @@ class Scene:
 
 
 def thing(type_name: str, position: Vector, *, size: Vector | None = None, name: str = "", **state: object) -> Thing:
-    """An object of `type_name` standing on `position` (the middle of its bottom), with its type's abilities and size."""
+    """An object of `type_name` standing on `position` (the middle of its bottom), as its type is."""
     size = size or kind(type_name).size
     centre = (position[0], position[1] + size[1] / 2, position[2])
     made = object_id(type_name, position)

@@ -1,6 +1,6 @@
 """What the agent sees: objects near enough, in the field of view, not shut away, and not behind something.
 
-AI2-THOR calls an object visible when a point of it is within the visibility distance (horizontally), inside the picture,
+AI2-THOR calls an object visible when a point of it is within the visibility distance (horizontally), in the picture,
 and not hidden. Here the points are a 3 x 3 x 3 grid over the object's box and the box's point nearest to the camera;
 something hides a point if the segment from the camera to it passes through a wall or a large object's box.
 """
@@ -22,8 +22,28 @@ Floats = npt.NDArray[np.float64]
 BLOCKING = 0.12
 """Cubic metres: boxes at least this large hide what is behind them (a cupboard does, a plate does not)."""
 
-SEE_THROUGH = frozenset({"Floor", "Window", "Painting", "Mirror", "Blinds", "Curtains", "Shelf", "HousePlant", "Chair",
-    "ShelvingUnit", "FloorLamp", "Desk", "DiningTable", "CoffeeTable", "SideTable", "TVStand", "ArmChair", "Sofa"})
+SEE_THROUGH = frozenset(
+    {
+        "Floor",
+        "Window",
+        "Painting",
+        "Mirror",
+        "Blinds",
+        "Curtains",
+        "Shelf",
+        "HousePlant",
+        "Chair",
+        "ShelvingUnit",
+        "FloorLamp",
+        "Desk",
+        "DiningTable",
+        "CoffeeTable",
+        "SideTable",
+        "TVStand",
+        "ArmChair",
+        "Sofa",
+    }
+)
 """Boxes that are mostly empty: one looks under a table, between the legs of a chair, over the seat of a sofa."""
 
 _GRID = np.array([(x, y, z) for x in (-0.48, 0, 0.48) for y in (-0.48, 0, 0.48) for z in (-0.48, 0, 0.48)])
@@ -112,7 +132,9 @@ class Sight:
         nearest = np.clip(eye, self._low, self._high)
         return bool(self._in_picture(which, nearest, eye, turn, agent)[0])
 
-    def _in_picture(self, which: npt.NDArray[np.intp], nearest: Floats, eye: Floats, turn: Floats, agent: Agent) -> Floats:
+    def _in_picture(
+        self, which: npt.NDArray[np.intp], nearest: Floats, eye: Floats, turn: Floats, agent: Agent
+    ) -> Floats:
         low, high = self._low[which], self._high[which]
         grid = ((low + high) / 2)[:, None] + _GRID * (high - low)[:, None]
         points = np.concatenate([grid, nearest[which][:, None]], axis=1)

@@ -26,7 +26,9 @@ def play(seed: int, **options):
     return env, info, total
 
 
-@pytest.mark.parametrize("options", [{"max_steps": 9}, {"max_steps": 9, "action_mode": "menu", "images": True}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{"max_steps": 9}, {"max_steps": 9, "action_mode": "menu", "images": True}], ids=str
+)
 @pytest.mark.parametrize("seed", [0, 5])
 def test_the_contract_holds(options, seed):
     check_environment(Task("alfred", seed, options), seed=seed)

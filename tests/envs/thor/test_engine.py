@@ -113,7 +113,16 @@ def test_snapshots_are_identities_under_random_play():
     rng = random.Random(5)
     w, twin = world(), world()
     ids = [t.id for t in w.scene.things]
-    names = ["MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "PickupObject", "OpenObject", "SliceObject"]
+    names = [
+        "MoveAhead",
+        "RotateLeft",
+        "RotateRight",
+        "LookUp",
+        "LookDown",
+        "PickupObject",
+        "OpenObject",
+        "SliceObject",
+    ]
     for _ in range(120):
         action = {"action": rng.choice(names), "objectId": rng.choice(ids)}
         blob = w.snapshot()
@@ -149,7 +158,7 @@ def test_shortest_ways_are_straight_where_nothing_is_between():
     # 3 cells east and 4 north, free: 5 * 0.25 m
     best, towards = distances([(4, 4)], CELLS)
     assert best[(1, 0)] == pytest.approx(1.25) and corners((1, 0), towards) == [(1, 0), (4, 4)]
-    # with the column x = 2 closed but for z = 0, the way from (1, 4) to (3, 4) goes round by (2, 0): 4 + 4 moves at least
+    # with the column x = 2 closed but for z = 0, the way from (1, 4) to (3, 4) goes round by (2, 0): 8 cells at least
     walled = CELLS - {(2, j) for j in range(1, 5)}
     best, _ = distances([(3, 4)], walled)
     assert not straight((1, 4), (3, 4), walled)
