@@ -24,6 +24,8 @@ OPTIONS: dict[str, list[dict[str, Any]]] = {
         {"size": "tiny", "shift_hours": 0.1, "observation": "compact", "action_mode": "menu"},
         {"size": "tiny", "shift_hours": 0.1, "max_steps": 5, "images": True},
     ],
+    "alfred": [{"max_steps": 6}, {"max_steps": 6, "action_mode": "menu", "images": True}],
+    "robothor": [{"max_steps": 6}, {"max_steps": 6, "preset": "casestudy", "action_mode": "menu", "images": True}],
 }
 """Options under which an episode is short; an environment without an entry is checked as it comes."""
 
