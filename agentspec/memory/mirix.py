@@ -150,7 +150,7 @@ class Mirix:
         },
         needs=("embedder",),
         small=(
-            {"every": 3, "core_chars": 20, "max_entries": 2},
+            {"every": 3, "core_chars": 12, "max_entries": 2},
             {"every": 3, "routing": "single", "topic": "state", "max_entries": 2},
         ),
     )

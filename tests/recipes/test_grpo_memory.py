@@ -45,7 +45,7 @@ def test_three_updates_with_the_cheat_sheet_in_the_loop(
         "agent": json.dumps(AGENT),
         "environment": json.dumps({"name": TOY, "options": {"steps": 3, "menu": True}}),
         "write_credit": credit,
-        "mask_truncated": "reasoning.none",  # a random model never ends a sheet
+        "mask_truncated": "reasoning.react/think",  # of no call here: a random model never ends a sheet
         "num_generations": "2",
         "gradient_accumulation_steps": "2",
         "max_steps": "3",

@@ -133,7 +133,7 @@ def test_nothing_to_learn_is_no_nan(tmp_path: Path) -> None:
 
 def test_losses_that_weigh_rows_are_named_or_refused(tmp_path: Path) -> None:
     for loss_type, spec in LOSSES.items():
-        told = notes(configured(tmp_path, loss_type=loss_type))
+        told = [n for n in notes(configured(tmp_path, loss_type=loss_type)) if "depend on rows" in n]
         assert [loss_type in note and "'dapo' does not depend on rows" in note for note in told] == (
             [True] if spec.depends_on_rows else []
         )
