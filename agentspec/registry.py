@@ -198,7 +198,7 @@ class Registry:
             self.all(kind)
         elif name.isidentifier() and name in self._files(kind):
             self._from_file(kind, name)
-        elif name not in self._known[kind]:
+        if name not in self._known[kind]:
             for point in _entry_points(kind):
                 if point.name == name:
                     self._from_entry_point(point)

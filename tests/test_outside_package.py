@@ -82,9 +82,11 @@ def test_it_runs(installed: Path, way: str) -> None:
     assert outcome["episodes"] == 2 and outcome["failed"] == 0
 
 
-def test_it_is_evaluated(installed: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("way", ["import", "entry points"])
+def test_it_is_evaluated(installed: Path, tmp_path: Path, way: str) -> None:
+    more, path = (imported(), PACKAGE) if way == "import" else ([], installed)
     command = ["eval", "--env", "lift", "--policies", "upwards", *MODEL, "--specs", f"mine={SPEC}", "--seeds", "0-3"]
-    done = agentspec(*command, "--out", str(tmp_path), path=installed)
+    done = agentspec(*command, *more, "--out", str(tmp_path), path=path)
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text(encoding="utf-8").splitlines()]
     assert [row["status"] for row in rows] == ["completed"] * 4
@@ -92,26 +94,33 @@ def test_it_is_evaluated(installed: Path, tmp_path: Path) -> None:
     assert {row["success"] for row in rows} == {True, False}
 
 
-@pytest.fixture
-def brought_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+@pytest.fixture(params=["import", "entry points"])
+def brought_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, installed: Path) -> Iterator[str]:
+    """The package in this process, by import or found by its entry points when a name is looked up."""
     from agentspec.registry import REGISTRY, import_modules
 
-    monkeypatch.syspath_prepend(str(PACKAGE))
-    import_modules(IMPORTS)
-    yield
+    if request.param == "import":
+        monkeypatch.syspath_prepend(str(PACKAGE))
+        import_modules(IMPORTS)
+    else:
+        monkeypatch.syspath_prepend(str(installed))
+        for kind, name in NAMES.items():
+            assert REGISTRY.get(kind, name).target.startswith(("outside_agents.", "outside/"))
+    yield request.param
     for kind, name in NAMES.items():
         REGISTRY.unregister(kind, name)  # type: ignore[arg-type]  # kinds by name
     for name in IMPORTS:
         sys.modules.pop(name)
 
 
-def test_it_keeps_the_contract_of_environments(brought_in: None) -> None:
+@pytest.mark.parametrize("brought_in", ["import"], indirect=True)
+def test_it_keeps_the_contract_of_environments(brought_in: str) -> None:
     from agentspec.envs import check_environment
 
     check_environment("outside/Lift-v0")
 
 
-def test_two_updates_are_trained_in_it(brought_in: None, tmp_path: Path) -> None:
+def test_two_updates_are_trained_in_it(brought_in: str, tmp_path: Path) -> None:
     pytest.importorskip("trl")
     from datasets import Dataset
 
@@ -127,7 +136,7 @@ def test_two_updates_are_trained_in_it(brought_in: None, tmp_path: Path) -> None
     config = ScaffoldConfig(
         output_dir=str(tmp_path),
         agent={
-            "imports": IMPORTS,
+            **({"imports": IMPORTS} if brought_in == "import" else {}),
             "perception": "generic",
             "reasoning": {"name": "two_minds", "thought_tokens": 4},
             "memory": {"name": "sticky_notes", "every": 2, "note_tokens": 8},
