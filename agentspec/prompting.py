@@ -17,6 +17,7 @@ credited like the one that succeeds.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,8 @@ ON_REQUEST = "What you are asked to write stands at the end of each message; wri
 AGAIN = "No action could be read from this answer: {problem}. {how}"
 TRANSCRIPT = "Transcript so far:\n{text}\n\n"
 MAX_RETRIES = 2
+
+_INVENTED = re.compile(r"^\W{0,4}(?:observation|user|human|environment|action)\b", re.IGNORECASE | re.MULTILINE)
 
 FollowUp = Callable[[Sequence[Message], Sampled, str], Sequence[Message]]
 """(prompt, what was answered, reply to it) -> the prompt of the next question."""
@@ -109,10 +112,12 @@ def quote(text: str, action: Action | None, budget: int, services: Services) -> 
     if action is None:
         return clip(shown, budget, services) or "(nothing)"
     line = f"Action: {action.text}"
-    reading = shown[: shown.rfind(action.text)] if action.text in shown else shown
-    reasons = reading.rstrip(" \t\n`*\"'")
+    before, _, after = shown.rpartition(action.text)
+    reasons = (before or ("" if after != shown else shown)).rstrip(" \t\n`*\"'")
     for label in ("Action:", "action:", "ACTION:", "Action"):
         reasons = reasons.removesuffix(label).rstrip(" \t\n`*#")
+    if not reasons:  # who names the action first gives the reasons after it
+        reasons = _INVENTED.split(after, maxsplit=1)[0].strip(" \t\n`*\"'")
     reasons = clip(reasons, budget - services.llm.count_tokens(line) - 1, services).strip()
     return f"{reasons}\n{line}" if reasons else line
 

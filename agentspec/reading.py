@@ -27,7 +27,7 @@ from agentspec.values import CALL, DRESS, MOST_CALLS, REMARK, SPACED_CALL, SQUAR
 from agentspec.visible import undressed, visible
 
 _LABEL = re.compile(
-    r"^[ \t>#*_\-•\"'`{]*(?:\(?\d+[.):][ \t]*)?[\"'*_` \t]*"
+    r"^[ \t>#*_\-•\"'`{]{0,40}(?:\(?\d{1,4}[.):][ \t]*)?[\"'*_` \t]{0,40}"
     r"(?:(?:final|next|chosen|my|the|best|selected|recommended|proposed)[ \t]+)*"
     r"(?:action|answer|command)(?:[ \t]+(?:call|taken|to take|is))?(?:[ \t]*\d+)?[ \t\"'*_`]*"
     r"(?:[:=][ \t*_]*|(?<=[*_#])[ \t]*$|(?<=action)[ \t]*$)",
@@ -44,6 +44,9 @@ _BULLET = re.compile(r"^[ \t>]*(?:[*•\-]|\(?\d{1,2}[.):])[ \t]+")
 _NEGATED = re.compile(
     r"(?:\bnot|n't|\bnever|\bavoid(?:ing)?|\binstead of|\brather than|\bwithout|\bcannot)\W+(?:\w+\W+)?$", re.I
 )
+
+LONGEST = 50_000
+"""Signs of an answer that are read: of a longer one the beginning and the end, half each."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def labelled(line: str) -> bool:
 def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     """Read an answer; `cut` says that it ended because its room was used up."""
     shown, open_block = visible(text)
-    plain = undressed(shown)
+    plain = undressed(_bounded(shown))
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
     if isinstance(reading.action, Action):
         return reading
@@ -107,7 +110,8 @@ class _Reader:
     """Reads one plain text; the methods are the rules of the module's docstring, in order."""
 
     def __init__(self, text: str, schema: ActionSchema) -> None:
-        turn = next((m.start() for m in _TURN.finditer(text) if _after_thought(text[: m.start()])), len(text))
+        spoken = _first_spoken(text)
+        turn = next((m.start() for m in _TURN.finditer(text) if m.start() > spoken), len(text))
         self.text = text[:turn]
         self.schema = schema
         self.values = Values(schema)
@@ -146,7 +150,8 @@ class _Reader:
             start, at = at, at + len(line)
             if found and _TURN.match(line):
                 break
-            action = None if _THOUGHT.match(line) else self._action_line(self.text[start:], line)
+            window = self.text[start : at + literals.MAX_LENGTH]
+            action = None if not line.strip() or _THOUGHT.match(line) else self._action_line(window, line)
             if action is not None:
                 found.append((action, start, bool(_BULLET.match(line))))
                 prose_after = False
@@ -162,7 +167,7 @@ class _Reader:
 
     def _action_line(self, text: str, line: str) -> Action | ActionError | None:
         """The action that `text` begins with if its first line, `line`, is nothing but an action and a remark."""
-        dressed = DRESS.match(text)
+        dressed = DRESS.match(line)
         bare = text[dressed.end() :] if dressed and dressed.end() < len(line) else text
         choice = self.values.choice(bare)
         if choice is not None:
@@ -170,7 +175,7 @@ class _Reader:
         match = CALL.match(bare) or SPACED_CALL.match(bare)
         if match is not None:
             action = self.values.call(bare, match)
-            whole = scan_call(bare, match)
+            whole = scan_call(bare, match) if action is not None else None
             known = known_name(match.group(1), self.schema) is not None
             if action is None or whole is None or not REMARK.match(bare, whole.end):
                 # `MOVE(1)(2)` is an action gone wrong, "I think (perhaps) so" is none.
@@ -214,13 +219,27 @@ class _Reader:
         found: list[tuple[Action, int, int]] = []
         for choice in sorted(self.schema.choices, key=len, reverse=True):
             for match in re.finditer(rf"(?<!\w){re.escape(choice)}(?!\w)", text, re.IGNORECASE):
+                if len(found) >= MOST_CALLS:
+                    break
                 if not any(s < match.end() and match.start() < e for _, s, e in found):
                     found.append((Action(choice, text=choice), match.start(), match.end()))
         return sorted(found, key=lambda f: f[1])
 
 
-def _after_thought(text: str) -> bool:
-    return any(_THOUGHT.match(line) or _LABEL.match(line) for line in text.splitlines())
+def _first_spoken(text: str) -> int:
+    """Where the first thought or `Action:` line begins; the end of the text if none does."""
+    at = 0
+    for line in text.splitlines(keepends=True):
+        if _THOUGHT.match(line) or _LABEL.match(line.rstrip("\n")):
+            return at
+        at += len(line)
+    return len(text)
+
+
+def _bounded(text: str) -> str:
+    """A text that is too long to be read loses its middle."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]}\n{text[-half:]}"
 
 
 def _thought(text: str) -> str:

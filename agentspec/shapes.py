@@ -14,11 +14,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agentspec.literals import known_name, literal, render_call, scan_arguments
+from agentspec.literals import MAX_LENGTH, known_name, literal, render_call, scan_arguments
 from agentspec.types import ActionSchema
 
 WRAPPERS = ("tool_calls", "tool_call", "function_call", "function", "call", "actions")
-NAMES = ("action", "action_call", "next_action", "final_action", "command", "tool", "tool_name", "action_name", "name")
+NAMES = (
+    "action",
+    "action_call",
+    "next_action",
+    "final_action",
+    "command",
+    "tool",
+    "tool_name",
+    "action_name",
+    "name",
+    "type",
+)
 ARGUMENTS = (
     "args",
     "arguments",
@@ -34,11 +45,16 @@ THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "ana
 MOST_OBJECTS = 16
 """Opening brackets that are tried before a text is taken to hold no data."""
 
+_COMMENT = re.compile(r"[ \t]+//[^\n\"]*$", re.MULTILINE)
 _FUNCTION = re.compile(
     r"<function=([\w.\-]+)>|<invoke\s+name=[\"']([\w.\-]+)[\"']\s*>|\bto=functions\.([\w\-]+)[^{}\n]*"
+    r"|<tool_call>\s*([\w.\-]+)\s*(?=<arg_key>)|\[TOOL_CALLS\]\s*([\w.\-]+)\[ARGS\]"
+    r"|<｜tool▁call▁begin｜>(?:function<｜tool▁sep｜>)?([\w.\-]+)|\bfunctions\.([\w\-]+):\d+"
 )
 _PARAMETER = re.compile(
-    r"<parameter(?:=([\w\-]+)|\s+name=[\"']([\w\-]+)[\"'])\s*>\s*(.*?)\s*</parameter>", re.DOTALL | re.IGNORECASE
+    r"<(?:parameter(?:=([\w\-]+)|\s+name=[\"']([\w\-]+)[\"'])\s*|arg_key>\s*([\w\-]+)\s*</arg_key>\s*<arg_value)>"
+    r"\s*(.*?)\s*</(?:parameter|arg_value)>",
+    re.DOTALL | re.IGNORECASE,
 )
 
 
@@ -71,8 +87,10 @@ def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | No
     name = known_name(next(g for g in tag.groups() if g), schema)
     if name is None:
         return None
-    rest = text[tag.end() :].split("</function>", maxsplit=1)[0].split("</invoke>", maxsplit=1)[0]
-    kwargs: dict[str, Any] = {a or b: _scalar(value) for a, b, value in _PARAMETER.findall(rest)}
+    rest = (
+        text[tag.end() : tag.end() + MAX_LENGTH].split("</function>", maxsplit=1)[0].split("</invoke>", maxsplit=1)[0]
+    )
+    kwargs: dict[str, Any] = {a or b or c: _scalar(value) for a, b, c, value in _PARAMETER.findall(rest)}
     brace = rest.find("{")
     data = _decode(rest, brace) if not kwargs and brace >= 0 else None
     return Shape(_build(name, data if isinstance(data, dict) else kwargs, schema), tag.start())
@@ -96,7 +114,7 @@ def _decode(text: str, at: int) -> Any:
     if end is None:
         return None
     try:
-        return literal(ast.parse(text[at:end], mode="eval").body)
+        return literal(ast.parse(_COMMENT.sub("", text[at:end]), mode="eval").body)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
         return None
 
@@ -106,6 +124,11 @@ def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  #
     if depth > 4 or not data:
         return None
     if isinstance(data, list):
+        if isinstance(data[0], str) and depth:
+            name = known_name(data[0], schema)
+            if name is not None:
+                return _build(name, data[1:] if not isinstance(data[-1], str) else [], schema)
+            return data[0] if "(" in data[0] or data[0] in schema.choices else None
         return from_data(data[0], schema, depth + 1) if isinstance(data[0], dict | list) else None
     if not isinstance(data, Mapping):
         return None
@@ -132,7 +155,7 @@ def _named(key: str, value: str, keys: Mapping[str, Any], schema: ActionSchema) 
     name = known_name(value, schema)
     if name is None:
         # A whole call, a menu entry, or what shall be reported as unknown; a bare "name" may be anything's.
-        return value or None if key not in ("name", "call", "function") or "(" in value else None
+        return value or None if key not in ("name", "call", "function", "type") or "(" in value else None
     given = next((keys[a] for a in ARGUMENTS if a in keys), None)
     if given is None:
         known = {p.casefold(): p for p in schema.actions[name].parameters}

@@ -16,15 +16,18 @@ MOST_CALLS = 64
 
 INPUT = re.compile(r"^[ \t*_`]*(?:action[ \t_]*input|arguments|args|parameters|input)[ \t*_`]*:[ \t*_`]*", re.I | re.M)
 DRESS = re.compile(r"^(?:(?:```|~~~)[\w+\-]*\s|[\s>#*_`~\"'•\-]|\(?\d{1,2}[.):](?=\s))+")
-CALL = re.compile(r"([A-Za-z_][\w.]*)[ \t]*\(")
-SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]*\(")
+CALL = re.compile(r"([A-Za-z_][\w.]{0,60})[ \t]{0,8}\(")
+SPACED_CALL = re.compile(r"([A-Za-z_][\w .\-]{0,40}?)[ \t]{0,8}\(")
 SQUARE = re.compile(r"([A-Za-z_][\w.\-]*)[ \t]*\[")
 WORD = re.compile(r"[A-Za-z_][\w\-]*")
 REMARK = re.compile(
-    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=]|"
-    r"(?:because|since|as|to|so|in order|and|then|or|if|for)\b)",
+    r"[\s`*_\"'.,;:!\])}]*(?:$|\n|;|[(\[{#–—\-/|>=\u2190-\u2bff\U0001f000-\U0001faff]|"
+    r"(?:because|since|as|to|so|in order|and|then|or|if|for)\b|"
+    r"(?<=[.!]\s)(?-i:[A-Z])(?![^\n]*(?:\w\(|\b(?:no|not|but|instead|actually|wait|then)\b)))",
     re.IGNORECASE,
 )
+_PAIR = re.compile(r"^[ \t]+([A-Za-z_]\w*)[ \t]*:[ \t]*(\S.*?)[ \t]*$", re.MULTILINE)
+_BLOCK = re.compile(r"\s*\n(?:[ \t]+[A-Za-z_]\w*[ \t]*:[ \t]*\S.*(?:\n|\Z))+")
 
 
 def takes_lines(text: str) -> bool:
@@ -94,6 +97,9 @@ class Values:
                 if text[given.end() :][:1] not in "{["
                 else text[given.end() :]
             )
+            block = _BLOCK.match(text, given.end())
+            if block is not None:
+                return self.read(f"{name}({', '.join(f'{k}={v}' for k, v in _PAIR.findall(block[0]))})")
             data = shapes.find_shape(f'{{"action": "{name}", "args": ' + value.rstrip("`\n ") + "}", self.schema)
             line = first_line(value).strip("`\"'* ")
             inner = data.text if data is not None else f"{name}({line})"
@@ -127,4 +133,9 @@ def squeeze(text: str) -> str:
 
 def first_line(text: str) -> str:
     """The first line that is not empty."""
-    return next((line for line in text.splitlines() if line.strip()), "")
+    sign = re.search(r"\S", text)
+    if sign is None:
+        return ""
+    start = text.rfind("\n", 0, sign.start()) + 1
+    end = text.find("\n", sign.end())
+    return (text[start:] if end < 0 else text[start:end]).rstrip("\r")

@@ -9,16 +9,32 @@ from __future__ import annotations
 
 import re
 
-_BLOCKS = "think|thinking|thoughts?|reasoning|reason|reflection|analysis|scratchpad|inner_monologue"
-_BLOCK = re.compile(rf"<(/?)(?:{_BLOCKS})\b[^<>]*>|\[(/?)THINK\]|◁(/?)think▷", re.IGNORECASE)
+_BLOCKS = "think|thinking|thoughts?|reasoning|reason|reflection|analysis|scratchpad|inner_monologue|antthinking"
+_BLOCK = re.compile(rf"<(/?)(?:\w+:)?(?:{_BLOCKS})\b[^<>]*>|\[(/?)THINK\]|◁(/?)think▷", re.IGNORECASE)
+_OTHER_BLOCKS = (
+    (re.compile(r"<\|begin_of_thought\|>"), re.compile(r"<\|end_of_thought\|>")),
+    (re.compile(r"<\|channel>thought\b"), re.compile(r"<channel\|>")),
+)
 _FINAL = re.compile(r"<\|channel\|>\s*final\s*<\|message\|>")
+_BARE_FINAL = re.compile(r"\Aanalysis(?=[A-Z\W]).*?assistantfinal", re.DOTALL)
+"""Harmony channels whose marks a server has dropped."""
 _TOOL = re.compile(r"<\|channel\|>\s*commentary\s+(?=to=)")
 _TOKEN = re.compile(r"<\|[^<>|]{1,40}\|>|</s>|<end_of_turn>|<eos>")
 _AS_LABEL = re.compile(r"<(action|answer|final_answer|command)>(.*?)(?:</\1>|$)", re.IGNORECASE | re.DOTALL)
 _BOXED = re.compile(r"\\boxed\{([^{}]*)\}")
+_QUOTES = str.maketrans(dict.fromkeys("“”„«»「」『』", '"'))
+_OBJECT = re.compile(r'[{,]\s*"\w+"\s*:')
 _SIGNS = str.maketrans(
-    {"“": '"', "”": '"', "‘": "'", "’": "'", "（": "(", "）": ")", "：": ":", "−": "-", "\u00a0": " ", "\u200b": ""}
+    dict.fromkeys("‘’‚", "'")
+    | {"（": "(", "）": ")", "：": ":", "，": ",", "−": "-", "\u00a0": " ", "\u202f": " ", "\u200b": ""}
 )
+_MINUS = re.compile(r"(?<=[\s(,=])[–—](?=\d)")
+_TAG = re.compile(
+    r"</?(?:b|i|em|strong|code|pre|p|br|span|response|output|result|choice|tool_code)[ \t]*/?>", re.IGNORECASE
+)
+_RULE = re.compile(r"^[ \t]*\|[^\n]*\n[ \t]*\|(?:[ \t]*:?-+:?[ \t]*\|)+[ \t]*$", re.MULTILINE)
+_PRINT = re.compile(r"^[ \t]*print\(([^\n]*)\)[ \t]*$", re.MULTILINE)
+_ROW = re.compile(r"^[ \t]*\|([^\n]*)\|[ \t]*$", re.MULTILINE)
 
 
 def visible(text: str) -> tuple[str, bool]:
@@ -29,11 +45,14 @@ def visible(text: str) -> tuple[str, bool]:
         if len(parts) == 1 and tool is None:
             return "", True
         text = parts[-1] if len(parts) > 1 else text[tool.end() :] if tool else ""
+    text = _BARE_FINAL.sub("", text, count=1)
+    for opens, closes in _OTHER_BLOCKS:
+        text = closes.sub("</think>", opens.sub("<think>", text))
     kept: list[str] = []
     depth = at = 0
     for match in _BLOCK.finditer(text):
-        closes = "/" in (match.group(1) or "", match.group(2) or "", match.group(3) or "")
-        if not closes:
+        closing = "/" in (match.group(1) or "", match.group(2) or "", match.group(3) or "")
+        if not closing:
             if not depth:
                 kept.append(text[at : match.start()])
             depth += 1
@@ -49,6 +68,10 @@ def visible(text: str) -> tuple[str, bool]:
 
 def undressed(text: str) -> str:
     """Signs and marks of prose made plain: curly quotes, escaped underscores, tags and boxes around an answer."""
-    text = text.translate(_SIGNS).replace("\\_", "_")
+    # Quotes within the strings of JSON are none of its own.
+    text = text if _OBJECT.search(text) else text.translate(_QUOTES)
+    text = _MINUS.sub("-", text.translate(_SIGNS)).replace("\\_", "_")
+    text = _PRINT.sub(r"\1", text)
+    text = _ROW.sub(lambda m: m[1].replace("|", "\n"), _RULE.sub("", _TAG.sub("", text)))
     text = _AS_LABEL.sub(lambda m: f"\nAction: {m.group(2).strip()}\n", text)
     return _BOXED.sub(lambda m: f"\nAction: {m.group(1)}\n", text).strip()

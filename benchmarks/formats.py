@@ -147,6 +147,28 @@ FORMATS: dict[str, Format] = {
     "two actions": lambda a, d: f"Action: {a}\nAction: {d}",
     "two calls": lambda a, d: f"{a}\n{d}",
     "plan, then label": lambda a, d: f"Plan:\n1. {d}\n2. something else\n\nAction: {a}",
+    "prefixed think block": lambda a, d: f"<seed:think>Action: {d}</seed:think>{a}",
+    "mixed-case think block": lambda a, d: f"<antThinking>{d}</antThinking>\n{a}",
+    "thought marked by tokens": lambda a, d: (
+        f"<|begin_of_thought|>Action: {d}<|end_of_thought|><|begin_of_solution|>{a}<|end_of_solution|>"
+    ),
+    "thought channel": lambda a, d: f"<|channel>thought\nAction: {d}<channel|>{a}",
+    "channels without their marks": lambda a, d: f"analysisWe could do {d}. Action: {d}assistantfinal{a}",
+    "response tag": lambda a, d: f"<think>{d}</think><response>{a}</response>",
+    "html": lambda a, d: f"<b>Action:</b> <code>{a}</code>",
+    "guillemets": lambda a, d: f"«{a}»",
+    "corner quotes": lambda a, d: f"「{a}」",
+    "low quotes": lambda a, d: f"Action: „{a}“",
+    "table": lambda a, d: f"| Step | Action |\n|---|---|\n| 1 | {a} |",
+    "table of fields": lambda a, d: f"| Field | Value |\n|:--|:--|\n| Reason | it pays |\n| Action | {a} |",
+    "politeness": lambda a, d: f"{a}. Happy to help further!",
+    "pictograph": lambda a, d: f"{a} ✅",
+    "refusal first": lambda a, d: (
+        f"I'm sorry, I cannot act in the real world. In this simulation I would choose:\n\n{a}"
+    ),
+    "json, list of calls": lambda a, d: json.dumps({"actions": [a, d]}),
+    "json with typographic quotes": lambda a, d: json.dumps({"thought": "„hot“ food", "action": a}, ensure_ascii=False),
+    "json with a comment": lambda a, d: f'{{\n  "action": {json.dumps(a)}, // pays\n  "sure": true\n}}',
     "label in a sentence": lambda a, d: f"Maybe Action: {d} would do,\nbut not now.\nAction: {a}",
 }
 """Name of a form -> how it is written."""

@@ -17,6 +17,7 @@ from agentspec.llm.scripted import ScriptedLLM
 from agentspec.registry import REGISTRY
 from agentspec.spec import AgentSpec
 from agentspec.state import write_atomic
+from agentspec.tokens import estimate_tokens
 from agentspec.types import Task
 
 FOLDER = Path(__file__).with_name("prompts")
@@ -24,6 +25,7 @@ STEP = 2
 ENVIRONMENTS: dict[str, Task] = {
     "DeliveryBench, native actions": Task("deliverybench", 1, {"size": "small", "observation": "full"}),
     "DeliveryBench, menu": Task("deliverybench", 1, {"size": "small", "observation": "compact", "action_mode": "menu"}),
+    "MiniGrid": Task("minigrid", 1),
 }
 LAYOUTS = ("conversation", "snapshot")
 ANSWERS = {
@@ -36,7 +38,21 @@ ANSWERS = {
     "think": "The board should be read first.",
     "argue": "The board should be read first.",
 }
+ANSWERS_IN_A_GRID = {
+    "plan": "1. Find the box\n2. Go to it\n3. Say so",
+    "feedback": "Verdict: change\nThat is a wall.",
+    "world": "One cell further.\nEarned: 0\nGoal: no",
+    "reflect": "Look around before walking.",
+}
 ACTIONS = ("VIEW_ORDERS()", "WAIT(60)", "VIEW_ORDERS()")
+IN_A_GRID = ("FORWARD()", "TURN_LEFT()", "FORWARD()")
+
+
+class Scripted(ScriptedLLM):
+    """Counts tokens as models do (about four signs each) and not by the byte, so budgets cut where they would."""
+
+    def count_tokens(self, text: str) -> int:
+        return estimate_tokens(text)
 
 
 def methods() -> dict[str, dict[str, Any]]:
@@ -58,8 +74,10 @@ def answer(request: Request) -> str:
     """What the scripted model says."""
     if request.sampling.choices:
         return request.sampling.choices[min(request.tag.step, len(request.sampling.choices) - 1)]
-    action = ACTIONS[request.tag.step % len(ACTIONS)]
-    return ANSWERS.get(request.tag.purpose, f"Thought: step {request.tag.step + 1} of the plan.\nAction: {action}")
+    grid = "- TURN_LEFT()" in request.messages[0].text
+    action = (IN_A_GRID if grid else ACTIONS)[request.tag.step % len(ACTIONS)]
+    answers = {**ANSWERS, **(ANSWERS_IN_A_GRID if grid else {})}
+    return answers.get(request.tag.purpose, f"Thought: step {request.tag.step + 1} of the plan.\nAction: {action}")
 
 
 def requests_of(spec: dict[str, Any], task: Task) -> list[Request]:
@@ -73,7 +91,7 @@ def requests_of(spec: dict[str, Any], task: Task) -> list[Request]:
             kept.append(request)
             return answer(request)
 
-        runner = Runner(AgentSpec.from_data(spec), ScriptedLLM(script), max_steps=STEP + 1)
+        runner = Runner(AgentSpec.from_data(spec), Scripted(script), max_steps=STEP + 1)
         (trajectory,) = runner.run([Job(task, run_seed=trial, memory_state=state)])
         state = trajectory.memory_state
     return requests

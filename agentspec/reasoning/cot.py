@@ -28,7 +28,7 @@ from agentspec.services import Services
 from agentspec.types import AgentInput, Decision, Recall
 
 THINK_THEN_CALL = (
-    "First think step by step about where you are, what pays and what the clock allows. "
+    "First think step by step about where things stand, what serves the task best and what time allows. "
     "Then end with one line of the form\nAction: NAME(arguments)"
 )
 THINK = "Think step by step in at most three short sentences; do not name the action yet."

@@ -45,6 +45,7 @@ from agentspec.reasoning.search.world import ModelWorld, RealWorld, World, rende
 from agentspec.registry import SpecError
 from agentspec.state import dump_state, load_state
 from agentspec.types import AgentInput, Decision, Recall, Task, Transition
+from agentspec.visible import visible
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
@@ -334,7 +335,7 @@ class LanguageAgentTreeSearch:
             return
         request = f"{render_steps(leaf, self.services, self.path_tokens)}\n\n{REFLECT.format(total=self._return(leaf))}"
         call = await search.meter.ask("reflect", with_request(search.base, request), max_tokens=self.prediction_tokens)
-        lesson = " ".join(call.text.split())
+        lesson = " ".join(visible(call.text)[0].split())
         if lesson:
             self._lessons = [*self._lessons, lesson][-self.max_reflections :]
 

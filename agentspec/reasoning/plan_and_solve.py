@@ -65,7 +65,7 @@ THINK_MENU = (
 ACT_MENU = "You are at sub-goal {number} of the plan: {goal}."
 SHOW_PLAN = "Plan:\n{plan}"
 
-_NUMBERED = re.compile(r"^\s*(?:\(?\d+[.):]|[-*•])\s*(\S.*)$", re.MULTILINE)
+_NUMBERED = re.compile(r"^[ \t]*(?:\(?\d+[.):]|[-*•])[ \t]*(\S.*)$", re.MULTILINE)
 _DONE = re.compile(
     r"(?P<asked>\?\s*)?\bsub-?goal(?:\s+\d+)?(?:\s+(?:is|has been|was))?(?P<not>\s+(?:not|n't|never)\b)?(?:\s+\w+)?\s+"
     r"(?:done|achieved|complete[d]?|finished)\b(?P<after>[^.\n]{0,40})",
@@ -304,7 +304,8 @@ def something_to_see(state: Mapping[str, Any]) -> bool:
 
 def says_done(words: str) -> bool:
     """Whether a step reports its sub-goal as done; "done? No, not yet" does not."""
-    for match in _DONE.finditer(visible(words)[0]):
+    words = visible(words)[0]
+    for match in _DONE.finditer(words):
         start = words.rfind("\n", 0, match.start()) + 1
         sentence = re.split(r"[.!;]\s", words[start : match.start()])[-1]
         if not match["not"] and not _DENIED.search(match["after"]) and not _DENIED.search(sentence):

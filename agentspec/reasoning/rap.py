@@ -11,7 +11,8 @@ Ending earns nothing by itself: a sum of negative log-probabilities would reward
 without the goal is charged, at its own rate, for the steps that were left and one more. What the world model says a
 step earns (in the environment's unit, divided by the environment's `typical_return`) enters as a share of the goal's
 reward. And with `reward="normalised"` (preset `rl`) log p(action) is taken per token, so that long calls are not the
-worse ones for their length. With `reward="paper"` and a model that predicts no earnings the numbers are the paper's.
+worse ones for their length. With `reward="paper"` and a model that predicts neither earnings nor an end
+without the goal the numbers are the paper's.
 
 The first action of the best path is executed. Log-probabilities need a backend that scores; `evaluation="samples"`
 counts samples instead. Nothing is executed while it searches: all states but the root's are imagined. Cost per step: at

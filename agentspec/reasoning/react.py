@@ -31,6 +31,7 @@ from agentspec.prompting import (
 from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
+from agentspec.tokens import clip_text
 from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
 from agentspec.visible import visible
 
@@ -54,6 +55,7 @@ class ReAct:
         thought_tokens: most tokens of a thought (`None`: the spec's `max_tokens`).
         history: steps of transcript shown in the `snapshot` layout.
         max_retries: further calls for an action that cannot be read.
+        observation_tokens: most tokens of each observation in that transcript, after what the environment said.
     """
 
     declaration = Declaration(
@@ -69,14 +71,16 @@ class ReAct:
         thought_tokens: int | None = None,
         history: int = 10,
         max_retries: int = MAX_RETRIES,
+        observation_tokens: int = 32,
     ) -> None:
         at_least("react", 1, max_iterations=max_iterations, history=history)
-        at_least("react", 0, max_retries=max_retries)
+        at_least("react", 0, max_retries=max_retries, observation_tokens=observation_tokens)
         self.services = services
         self.max_iterations = max_iterations
         self.limit = {} if thought_tokens is None else {"max_tokens": thought_tokens}
         self.history = history
         self.max_retries = max_retries
+        self.observation_tokens = observation_tokens
         self._transcript: list[str] = []
 
     def begin_episode(self, task: Task) -> None:
@@ -138,8 +142,15 @@ class ReAct:
         reading = read(rationale, transition.input.action_schema)
         thought = reading.thought if isinstance(reading.action, Action) else visible(rationale)[0]
         thought = " ".join(thought.split()).removeprefix("Thought:").strip()
+        self._see(transition.input.text)
         result = transition.info.get("error") or transition.info.get("message") or "done"
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
+
+    def _see(self, observation: str) -> None:
+        """Add to the step before what was observed after it; the newest observation stands in the prompt whole."""
+        if self._transcript and self.observation_tokens and self.services.context.layout == "snapshot":
+            seen = " ".join(observation.split())
+            self._transcript[-1] += f" | {clip_text(seen, self.observation_tokens, self.services.llm.count_tokens)}"
 
     def snapshot(self) -> bytes:
         return dump_state(self._transcript)

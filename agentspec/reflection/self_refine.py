@@ -116,8 +116,7 @@ class SelfRefine:
         """The decision, refined; as far as the budget allows."""
         draft = Draft(input, user_turn(input, recall, self.services), decision)
         draft.attempt(_shown(decision.action))
-        reasons = clip(" ".join(visible(decision.rationale)[0].split()), self.reason_tokens, self.services)
-        draft.comment(REASONS.format(reasons=reasons) if reasons else "")
+        draft.comment(self._reasons(decision.rationale))
         try:
             await self._refine(draft)
         except BudgetExceededError:
@@ -131,6 +130,10 @@ class SelfRefine:
         if draft.stopped == "budget":
             trace["exhausted"] = trace.get("exhausted") or "episode"
         return replace(draft.decision, trace=trace)
+
+    def _reasons(self, rationale: str) -> str:
+        reasons = clip(" ".join(visible(rationale)[0].split()), self.reason_tokens, self.services)
+        return REASONS.format(reasons=reasons) if reasons else ""
 
     async def _refine(self, draft: Draft) -> None:
         for _ in range(self.max_iterations):
@@ -174,16 +177,22 @@ class SelfRefine:
             turn=(action.text,),
             trace={**trace, "refined_from": draft.decision.action.text[:200]},
         )
+        draft.comment(self._reasons(reading.thought))
         return False
 
     def _prompt(self, draft: Draft, request: str) -> tuple[Message, ...]:
         history = "\n".join(self._within(draft.history))
-        turns = self.services.context.messages[1:] if self.conversation else ()
+        turns = self._earlier_turns() if self.conversation else ()
         return (
             system(static_prompt(draft.input, ON_REQUEST)),
             *turns,
             user(f"{draft.situation}\n\n{history}\n\n{request}"),
         )
+
+    def _earlier_turns(self) -> tuple[Message, ...]:
+        """The conversation before this step, whose situation, attempts and reasons the request holds itself."""
+        context = self.services.context
+        return context.messages[1 : 1 + len(context.older(1))]
 
     def _within(self, history: list[str]) -> list[str]:
         """The history within its budget: attempts and the latest comment stay, older comments go first."""

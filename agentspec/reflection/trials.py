@@ -18,6 +18,7 @@ from agentspec.memory.base import describe
 from agentspec.prompting import clip, static_prompt
 from agentspec.reading import read
 from agentspec.services import Services
+from agentspec.tokens import CountTokens
 from agentspec.trajectory import Trajectory
 from agentspec.types import Action, Recall, RecallItem, Task, Transition
 from agentspec.visible import visible
@@ -105,31 +106,25 @@ def trial_prompt(
     budget: int,
     services: Services,
     view_tokens: int = 512,
+    fullest_tokens: int = 1024,
 ) -> tuple[Message, ...]:
     """The trial as a reflector reads it.
 
     The task and its actions; earlier lessons; how it began, and the fullest view of the trial (the board of offers,
-    say) in `view_tokens` each; its steps with the thought behind each and what came of it, the newest that fit into
-    `budget` tokens; its return; the request.
+    say), in `view_tokens` and `fullest_tokens`; its steps with the thought behind each and what came of it, within
+    `budget` tokens: of a long trial the older steps lose their thoughts first, and a line says how many are left out;
+    its return; the request.
     """
     first = trajectory.transitions[0].input
     count = services.llm.count_tokens
-    lines: list[str] = []
-    used = 0
-    for transition in reversed(trajectory.transitions):
-        line = _told(transition)
-        used += count(line) + 1
-        if used > budget:
-            break
-        lines.append(line)
-    steps = "\n".join(reversed(lines))
+    steps = "\n".join(_steps_within(trajectory, budget, count))
     earlier = "\n".join(TRIAL.format(number=n, lesson=text) for n, text in log.lessons[-last:])
     fullest = max(trajectory.transitions, key=lambda t: len(t.input.text))
     parts = [
         *([f"{HEADER}\n{earlier}"] if earlier else []),
         SITUATION.format(text=clip(first.text, view_tokens, services)),
         *(
-            [FULLEST.format(number=fullest.step + 1, text=clip(fullest.input.text, view_tokens, services))]
+            [FULLEST.format(number=fullest.step + 1, text=clip(fullest.input.text, fullest_tokens, services))]
             if fullest.input.text != first.text
             else []
         ),
@@ -147,6 +142,24 @@ def trial_prompt(
         ),
         user("\n\n".join(parts)),
     )
+
+
+def _steps_within(trajectory: Trajectory, budget: int, count: CountTokens) -> list[str]:
+    """The steps of a trial, one a line; the newest keep their thoughts, then as many as fit are told without."""
+    bare = [describe(t) for t in trajectory.transitions]
+    costs = [count(line) + 1 for line in bare]
+    shown, used = len(bare), 0
+    while shown and used + costs[shown - 1] <= budget:
+        shown -= 1
+        used += costs[shown]
+    lines = bare[shown:]
+    for i in range(len(bare) - 1, shown - 1, -1):
+        told = _told(trajectory.transitions[i])
+        used += count(told) + 1 - costs[i]
+        if used > budget:
+            break
+        lines[i - shown] = told
+    return ([f"(the first {shown} steps are left out)"] if shown else []) + lines
 
 
 def _told(transition: Transition) -> str:

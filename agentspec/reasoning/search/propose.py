@@ -19,6 +19,9 @@ from agentspec.visible import visible
 MAX_LINE = 200
 """Characters of a step that is only imagined: a longer line is no action."""
 
+MAX_LINES = 200
+"""Lines of a list of proposals that are read."""
+
 _BULLET = re.compile(r"^\s*(?:[-*•]|\(?\d+[.):])\s*")
 
 
@@ -61,7 +64,7 @@ def read_steps(text: str, schema: ActionSchema, *, imagined: bool) -> list[str]:
     if whole is not None and takes_lines(text):
         return [whole[0]]
     found: dict[Hashable, str] = {}
-    lines = visible(text)[0].splitlines()
+    lines = [line for line in visible(text)[0].splitlines() if line.strip()][:MAX_LINES]
     for line in [line for line in lines if labelled(line)] or lines:
         bare = _BULLET.sub("", line, count=1)
         step = read_step(bare, schema, imagined=imagined) if bare.strip("` \t") else None

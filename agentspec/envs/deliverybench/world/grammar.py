@@ -171,10 +171,13 @@ def schema_for(rules: Rules) -> ActionSchema:
     return _schema(rules.bare_numbers_are_cm)
 
 
+_METRES = ("m", "meter", "meters", "metre", "metres")
+
+
 @lru_cache(maxsize=2)
 def _schema(centimetres: bool = False) -> ActionSchema:
     metre = 100.0 if centimetres else 1.0
-    return ActionSchema({spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, {"m": metre})
+    return ActionSchema({spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, dict.fromkeys(_METRES, metre))
 
 
 def _fitted(spec: ActionSpec, metre: float) -> ActionSpec:
