@@ -195,7 +195,8 @@ class RoboThorEnv(Game):
         after = self._distance()
         if before is not None and after is not None:
             self.earned += max(-moved, min(moved, before - after)) / max(self.episode.length, 1.0)
-        self.told = Told(CALLS[call][2]) if event.success else Told(error=event.error, code="failed")
+        # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
+        self.told = Told(CALLS[call][2] if event.success else f"could not {CALLS[call][1]}, {event.error}")
 
     def _in_view(self) -> bool:
         objects = self.world.observe().metadata["objects"]

@@ -112,3 +112,11 @@ def test_snapshots_are_identities():
         mine, theirs = env.step(text), twin.step(text)
         assert mine[0] == theirs[0] and mine[1:4] == theirs[1:4]
         info = mine[4]
+
+
+def test_a_blocked_move_takes_a_step_and_is_told():
+    env = RoboThorEnv(preset="casestudy", action_mode="menu")
+    env.reset(seed=0)
+    _, _, _, _, info = env.step("move ahead")  # the sofa is less than 0.5 m ahead
+    assert not info["invalid"] and "could not move ahead" in info["message"]
+    assert info["metrics"]["path_length"] == 0.0 and info["state"]["steps_left"] == 199
