@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from agentspec.actions import suggest
 from agentspec.llm.base import LLM
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec, ModuleSpec
@@ -87,9 +88,16 @@ class Policy:
         """
         settings = self.settings()
         if not self.scripted and settings["backend"] in ("local", "vision"):
-            from agentspec.llm.models import resolve
+            from agentspec.llm.models import BUNDLED, ModelNotFoundError, resolve
 
-            resolve(settings["model"], self.adapter or None)
+            try:
+                resolve(settings["model"], self.adapter or None)
+            except ModelNotFoundError as error:
+                known = [*(name.replace("_", "-") for name in SCRIPTED), *BUNDLED]
+                hint = suggest(settings["model"], known)
+                if settings["model"] in known or not hint.startswith("; did you mean"):
+                    raise
+                raise ModelNotFoundError(f"{error}{hint}") from None
 
     def build(self) -> LLM | None:
         """The backend, loaded; ``None`` for a scripted policy."""

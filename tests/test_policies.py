@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from agentspec.llm.models import ModelNotFoundError
 from agentspec.policies import Policy, needs_model, weights_digest
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -19,6 +20,15 @@ def test_parse(tmp_path: Path) -> None:
     for text in ("=model", "name=", ""):
         with pytest.raises(SpecError, match="NAME=MODEL"):
             Policy.parse(text)
+
+
+def test_a_mistyped_policy_is_told_the_nearest() -> None:
+    for typo, meant in (("rulebased", "rule-based"), ("smollm2-135", "smollm2-135m")):
+        with pytest.raises(ModelNotFoundError, match=f"no model '{typo}'.*; did you mean {meant}"):
+            Policy.parse(typo).check()
+    with pytest.raises(ModelNotFoundError) as told:
+        Policy.parse("nothing").check()
+    assert "did you mean" not in str(told.value)
 
 
 def test_a_scripted_policy_takes_the_place_of_reasoning() -> None:

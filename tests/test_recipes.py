@@ -162,7 +162,7 @@ def test_what_cannot_be_extended(tmp_path: Path, files: dict[str, str], message:
 
 
 def test_options_are_never_abbreviated(tmp_path: Path) -> None:
-    with pytest.raises(SpecError, match="--learning_rat"):
+    with pytest.raises(SpecError, match="unknown option '--learning_rat'; did you mean --learning_rate"):
         parse_config(["--learning_rat", "1", *ON_CPU], default=CONFIGS / "quickstart_cpu.yaml")
     assert parse_config(["--learning_rate", "1", *ON_CPU], default=CONFIGS / "cpu.yaml").learning_rate == 1
 

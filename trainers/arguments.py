@@ -60,10 +60,16 @@ def parse_config(argv: Sequence[str] | None = None, *, default: str | Path) -> S
         (word[2:].partition("=")[0].replace("-", "_") for word in rest if word.startswith("--")), "command line"
     )
     try:
-        (config,) = parser.parse_args_into_dataclasses(args=rest)
+        config, unread = parser.parse_args_into_dataclasses(args=rest, return_remaining_strings=True)
     except ValueError as error:
-        raise SpecError(f"{known.config}: {error}") from error
+        raise SpecError(f"{known.config}, with the command line: {error}") from error
+    if unread:
+        raise SpecError(f"unknown option {unread[0]!r}{suggest(unread[0], _options(parser))}")
     return config
+
+
+def _options(parser: argparse.ArgumentParser) -> list[str]:
+    return [option for action in parser._actions for option in action.option_strings if "-" not in option[2:]]
 
 
 def read_config(path: str | Path) -> dict[str, Any]:

@@ -307,6 +307,13 @@ def check_rounds(config: ScaffoldConfig) -> None:
             f"own; set steps_per_generation to {config.gradient_accumulation_steps} (the same rollouts in one round), "
             "or to a multiple of it (several updates a round)"
         )
+    tasks = (config.generation_batch_size or 0) // config.num_generations
+    if config.train_tasks < tasks:
+        raise SpecError(
+            f"train_tasks is {config.train_tasks}, and a generation round takes {tasks} different tasks "
+            f"({config.generation_batch_size} rollouts in groups of {config.num_generations}): not one round could be "
+            f"played; set train_tasks to at least {tasks}, or lower gradient_accumulation_steps"
+        )
 
 
 def check_validation(config: ScaffoldConfig) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import importlib
 import re
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -81,13 +83,15 @@ def environment_class(name: str) -> Any:
 
 
 def _import(module: str, name: str) -> None:
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.append(str(Path.cwd()))  # at the end: what lies there replaces nothing that is installed
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise
         raise SpecError(
-            f"env {name!r}: there is no module {module!r} here; install its package, or add its folder to PYTHONPATH"
+            f"env {name!r}: there is no module {module!r} here; install its package, or start where it lies"
         ) from error
 
 

@@ -6,10 +6,12 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 from agentspec.envs import check_environment, make_env
 from agentspec.envs.contract import INFO_KEYS
+from agentspec.envs.making import environment_id
 from agentspec.episode import Job, Runner
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
@@ -31,6 +33,19 @@ def test_the_example_keeps_the_contract(tmp_path: Path, monkeypatch: pytest.Monk
         assert played.scorable and played.metrics["invalid_actions"] == 0
     finally:
         sys.modules.pop("corridor", None)
+
+
+def test_the_folder_in_which_one_starts_is_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walled_corridor.py").write_text(
+        "import gymnasium\ngymnasium.register('Walled-v0', entry_point='x:Y')\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(tmp_path))])
+    try:
+        assert environment_id("walled_corridor:Walled-v0") == "Walled-v0"
+    finally:
+        sys.modules.pop("walled_corridor", None)
+        gymnasium.registry.pop("Walled-v0", None)
 
 
 def test_the_table_of_keys_is_complete() -> None:

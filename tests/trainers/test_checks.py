@@ -182,6 +182,14 @@ def test_a_number_out_of_its_range_is_refused(tmp_path: Path, changes: dict[str,
         config(tmp_path, **changes).check()
 
 
+def test_fewer_tasks_than_a_round_takes_are_refused(tmp_path: Path) -> None:
+    """The sampler drops a round that is not full: training would end at step 0 as if it had gone well."""
+    sizes = {"num_generations": 2, "per_device_train_batch_size": 2, "gradient_accumulation_steps": 6}
+    with pytest.raises(SpecError, match="train_tasks is 5, and a generation round takes 6 different tasks"):
+        config(tmp_path, train_tasks=5, **sizes).check()
+    config(tmp_path, train_tasks=6, **sizes).check()
+
+
 def test_a_weight_that_is_no_number_is_refused(tmp_path: Path) -> None:
     """It would make every return NaN, and every advantage 0."""
     with pytest.raises(SpecError, match="reward 'env' has weight nan"):
