@@ -78,7 +78,9 @@ def test_a_damaged_image_is_refused_and_the_index_stays():
     assert [k for k, _ in made.search("red", 1)] == [0]
 
 
-@given(st.lists(st.text("abcde é\u0301_ßK", max_size=24), max_size=12), st.text("abcde é\u0301ßk", max_size=30), st.data())
+@given(
+    st.lists(st.text("abcde é\u0301_ßK", max_size=24), max_size=12), st.text("abcde é\u0301ßk", max_size=30), st.data()
+)
 def test_leaving_out_frequent_words_changes_no_order(texts: list[str], query: str, data: st.DataObject):
     made = index(*texts)
     for key in data.draw(st.lists(st.integers(0, 12), max_size=4)):
