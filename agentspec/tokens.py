@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 
 CUT = " ..."
 """What stands where text was cut off."""
+
+_PARTS = re.compile(r"\n\s*\n| \| ")
+_LEAST = 8
 
 CountTokens = Callable[[str], int]
 
@@ -62,3 +66,45 @@ def clip_text(text: str, budget: int, count_tokens: CountTokens = estimate_token
         else:
             high = middle - 1
     return text[:low].rstrip() + CUT if low else ""
+
+
+def excerpt(text: str, budget: int, count_tokens: CountTokens = estimate_tokens) -> str:
+    """An observation on one line within `budget`: its paragraphs, of which the long ones are clipped.
+
+    The room goes to the paragraphs in proportion 1, 1/2, 1/3, ...: so the beginning is longest, but what follows it
+    (orders, what is carried) is there too. Short ones stay whole; one that would get less than 8 tokens is left out.
+
+    >>> excerpt("a long beginning, too long for the room\\n\\nOrders: 7, 9\\n\\nHere: nobody", 62, len)
+    'a long beginning, too long f ... | Orders: 7, 9 | Here ...'
+    """
+    parts = [" ".join(part.split()) for part in _PARTS.split(text)]
+    parts = [part for part in parts if part]
+    joined = " | ".join(parts)
+    if len(parts) < 2 or count_tokens(joined) <= budget:
+        return clip_text(joined, budget, count_tokens)
+    costs = [count_tokens(part) + count_tokens(" | ") for part in parts]
+    candidates = list(range(len(parts)))
+    while candidates:
+        shares = _shares(costs, candidates, budget)
+        clipped = [i for i in candidates if costs[i] > shares[i]]
+        if not clipped or shares[clipped[-1]] >= _LEAST + count_tokens(" | "):
+            break
+        candidates.remove(clipped[-1])
+    shown = [clip_text(parts[i], int(shares[i]) - count_tokens(" | "), count_tokens) for i in candidates]
+    return clip_text(" | ".join(filter(None, shown)) or joined, budget, count_tokens)
+
+
+def _shares(costs: Sequence[int], among: Sequence[int], budget: int) -> dict[int, float]:
+    """The room of each: what it costs if that is less than its share of what the others leave, else that share."""
+    shares: dict[int, float] = {}
+    waiting, left = list(among), float(budget)
+    while waiting:
+        unit = left / sum(1 / (i + 1) for i in waiting)
+        small = [i for i in waiting if costs[i] <= unit / (i + 1)]
+        if not small:
+            return shares | {i: unit / (i + 1) for i in waiting}
+        for i in small:
+            shares[i] = costs[i]
+            left -= costs[i]
+            waiting.remove(i)
+    return shares

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from agentspec.tokens import clip_text, estimate_tokens
+from agentspec.tokens import clip_text, estimate_tokens, excerpt
 
 Credit = Literal["executed", "explored", "aux"]
 """What a sampled completion did: chose the executed action, was explored and not taken, or helped (memory, critics)."""
@@ -388,5 +388,5 @@ class Experience:
         reward = f"\nReward: {self.reward:+.2f}" if self.reward else ""
         rest = f"Action: {self.action}\nResult: {self.feedback}{reward}"
         room = tokens - count_tokens(rest) - count_tokens("State: \n")
-        state = clip_text(" ".join(self.state.split()), room, count_tokens) if room > 0 else ""
+        state = excerpt(self.state, room, count_tokens) if room > 0 else ""
         return f"State: {state}\n{rest}" if state else clip_text(rest, tokens, count_tokens)

@@ -7,7 +7,7 @@ from collections import deque
 from agentspec.declaration import Declaration
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
-from agentspec.tokens import clip_text
+from agentspec.tokens import excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -48,8 +48,8 @@ class BaseMemory:
     async def store(self, transition: Transition) -> None:
         line = describe(transition)
         if self.observation_tokens and self.services.context.layout == "snapshot":
-            seen = " ".join(transition.input.text.split())
-            line += f"\n   seen: {clip_text(seen, self.observation_tokens, self.services.llm.count_tokens)}"
+            count = self.services.llm.count_tokens
+            line += f"\n   seen: {excerpt(transition.input.text, self.observation_tokens, count)}"
         self._lines.append(line)
 
     async def end_episode(self, trajectory: Trajectory) -> None:

@@ -30,7 +30,7 @@ from agentspec.protocols import Services
 from agentspec.retrieval import Lexical
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -59,6 +59,7 @@ FILL = (
 )
 TASK_TOKENS = 64
 PLACEHOLDER = re.compile(r"<[A-Za-z_][\w .-]*>")
+LONGEST = 100_000  # bytes of a value or row: no statement can make a note of megabytes
 MACHINE_STEPS = 1000  # SQLite instructions between two looks at the limit
 FUNCTIONS = frozenset(
     (
@@ -101,6 +102,7 @@ class Database:
         self.instructions = instructions
         self._db = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
         self._db.executescript(TABLES)
+        self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
         self._words = Lexical()
 
     def add(self, row: Sequence[Any]) -> None:
@@ -175,6 +177,8 @@ def _authorize(action: int, first: str | None, second: str | None, database: str
         return sqlite3.SQLITE_OK
     if action == sqlite3.SQLITE_READ and first in ("steps", "notes"):
         return sqlite3.SQLITE_OK
+    if action == sqlite3.SQLITE_READ and not second and database is None:  # count(*) of a WITH clause
+        return sqlite3.SQLITE_DENY if (first or "").casefold().startswith(("sqlite_", "pragma_")) else sqlite3.SQLITE_OK
     if action in (sqlite3.SQLITE_INSERT, sqlite3.SQLITE_UPDATE, sqlite3.SQLITE_DELETE) and first == "notes":
         return sqlite3.SQLITE_OK
     if action == sqlite3.SQLITE_FUNCTION and (second or "").casefold() in FUNCTIONS:
@@ -271,7 +275,7 @@ class ChatDB:
                 self.services.time().episode,
                 e.step,
                 place_of(transition.input.state),
-                clip_text(" ".join(e.state.split()), self.state_tokens, count),
+                excerpt(e.state, self.state_tokens, count),
                 name.strip(),
                 args.rstrip().removesuffix(")"),
                 int(e.ok),
@@ -324,7 +328,7 @@ class ChatDB:
             episode=newest[0],
             step=newest[1],
             actions=", ".join(f"{name} x{n}" for name, n in uses),
-            state=clip_text(" ".join(input.text.split()), self.state_tokens, count),
+            state=excerpt(input.text, self.state_tokens, count),
         )
 
     def _templates(self, input: AgentInput) -> list[tuple[str, str]]:
@@ -365,7 +369,7 @@ class ChatDB:
     def _line(
         self, episode: int, step: int, action: str, args: str, ok: int, feedback: str, reward: float, state: str
     ) -> str:
-        seen = clip_text(state, self.state_tokens // 4, self.services.llm.count_tokens)
+        seen = excerpt(state, self.state_tokens // 2, self.services.llm.count_tokens)
         told = f"{action}({args})" if action.isidentifier() else action
         paid = f" ({reward:+.2f})" if reward else ""
         name = step_name(episode, step, self.services.time())

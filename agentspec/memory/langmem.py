@@ -136,7 +136,7 @@ class LangMem:
         max_episodes: int = 200,
         entry_tokens: int = 64,
         instruction_tokens: int = 128,
-        state_tokens: int = 48,
+        state_tokens: int = 80,
         answer_tokens: int | None = None,
         steps_tokens: int = 1024,
     ) -> None:

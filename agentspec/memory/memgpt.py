@@ -144,7 +144,7 @@ class MemGPT:
         queue_tokens: int = 0,
         max_recall: int = 2000,
         max_archive: int = 500,
-        state_tokens: int = 48,
+        state_tokens: int = 80,
         answer_tokens: int | None = None,
         steps_tokens: int = 768,
     ) -> None:

@@ -154,7 +154,7 @@ class MemoryBank:
         time_unit: float = 100.0,
         duplicate: float = 0.9,
         max_entries: int = 500,
-        state_tokens: int = 48,
+        state_tokens: int = 80,
         answer_tokens: int | None = None,
         steps_tokens: int | None = None,
     ) -> None:

@@ -26,7 +26,7 @@ from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, RecallItem, Task, Transition
 
@@ -167,7 +167,7 @@ class Mirix:
         core_chars: int = 1000,
         entry_tokens: int = 96,
         max_entries: int = 200,
-        state_tokens: int = 48,
+        state_tokens: int = 80,
         answer_tokens: int | None = None,
         steps_tokens: int = 1024,
     ) -> None:
@@ -311,7 +311,7 @@ class Mirix:
         count = self.services.llm.count_tokens
         prompt = TOPIC.format(
             task=clip_text(input.instruction, TASK_TOKENS, count),
-            state=clip_text(" ".join(input.text.split()), self.steps_tokens // 4, count),
+            state=excerpt(input.text, self.steps_tokens // 4, count),
         )
         answer = await self.services.ask("topic", prompt, 64, json_of({"topic": str}))
         return str(answer.value["topic"]) if answer.value and answer.value["topic"].strip() else input.text

@@ -53,7 +53,7 @@ from agentspec.parameters import at_least, settings
 from agentspec.services import Services, Time
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, Task, Transition
 
@@ -298,7 +298,7 @@ class SimpleMemory:
         found = dict(self._keyed(self.search(state, k)))
         if not found:
             return []
-        seen = SEEN.format(state=clip_text(one_line(state), self.step_tokens, self.services.llm.count_tokens))
+        seen = SEEN.format(state=excerpt(state, self.step_tokens, self.services.llm.count_tokens))
         answer = await self._ask("plan", PLAN, seen, {"queries": list[str]})
         queries = answer["queries"] if answer else []
         for check in range(MOST_CHECKS + 1):

@@ -201,3 +201,21 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     look = chain(("notices", "SELECT state FROM steps WHERE state LIKE '%notice%' ORDER BY id DESC LIMIT 1"))
     assert succeeds({"name": "chatdb"}, scope=scope, layout=layout, curate={"query": look})
     assert succeeds({"name": "chatdb", "preset": "rl"}, scope=scope, layout=layout)
+
+
+def test_rows_of_a_with_clause_can_be_counted_and_those_of_the_schema_cannot() -> None:
+    database = Database()
+    database.add((None, 0, 1, "p", "s", "GO", "1", 1, "ok", 1.0))
+    assert database.run("WITH w AS (SELECT action FROM steps) SELECT count(*) AS n FROM w", 3) == "n: 1"
+    for name in ("sqlite_master", "SQLITE_Schema", "pragma_database_list"):
+        assert database.run(f"SELECT count(*) FROM {name}", 3).startswith("error: "), name
+    endless = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT count(*) FROM c"
+    assert database.run(endless, 3) == "error: stopped, it takes too long"
+
+
+def test_no_statement_makes_a_note_of_megabytes() -> None:
+    database, value = Database(), "'" + "a" * 20 + "'"
+    for _ in range(4):
+        value = f"replace({value}, 'a', '{'a' * 20}')"
+    assert database.run(f"INSERT INTO notes(note) VALUES ({value})", 3).startswith("error: ")
+    assert database.rows("SELECT count(*) FROM notes") == [(0,)]

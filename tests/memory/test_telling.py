@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from hypothesis import given
+from hypothesis import strategies as st
+
 from agentspec.memory.parts import telling
+from agentspec.tokens import estimate_tokens, excerpt
 from tests.memory.one_step import step
 
 
@@ -29,3 +33,19 @@ def test_what_fits() -> None:
     assert telling.newest_that_fit(["aaaa", "bb", "cc"], 6, len) == ["bb", "cc"]
     assert telling.newest_that_fit(["a" * 10], 8, len) == ["aaaa ..."]
     assert telling.within(["aa", "bb", "c"], 6, len) == ["aa", "bb"]
+
+
+def test_an_excerpt_of_an_observation_keeps_the_orders() -> None:
+    state = (
+        f"00:06 on the clock. {'You are on the way. ' * 20}\n\nYour orders:\n- order 9: in bag, 21 s left\n\nAround: x"
+    )
+    kept = excerpt(state, 48)
+    assert kept.startswith("00:06 on the clock.") and "order 9: in bag, 21 s left" in kept
+    assert excerpt(excerpt(state, 96), 48) == kept  # what was joined is still paragraphs
+    assert excerpt("one\nparagraph only", 99) == "one paragraph only"
+
+
+@given(st.text("ab c\n|", max_size=200), st.integers(0, 60))
+def test_an_excerpt_stays_within_its_budget(text: str, tokens: int) -> None:
+    assert excerpt(text, tokens) == "" or estimate_tokens(excerpt(text, tokens)) <= tokens
+    assert len(excerpt(text, tokens, len)) <= tokens

@@ -34,7 +34,7 @@ from agentspec.registry import SpecError
 from agentspec.retrieval import Graph, VectorIndex
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, RecallItem, Task, Transition
 
@@ -215,7 +215,7 @@ class ACE:
         shown = cited or self.playbook.ordered()
         head = (prompts.CITED if cited else prompts.SHOWN).format(bullets=_lines(shown))
         steps = f"{telling.STEPS}\n{telling.numbered(self._waiting.steps)}"
-        state = clip_text(" ".join(next_text.split()), self.step_tokens, self._count)
+        state = excerpt(next_text, self.step_tokens, self._count)
         now = [prompts.NOW.format(state=state)] if state else []
         parts = [*([head] if shown else []), steps, *now, prompts.REVIEW]
         prompt = _prompt(prompts.REFLECTOR.format(task=task), parts)

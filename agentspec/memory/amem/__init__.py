@@ -28,7 +28,7 @@ from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -131,7 +131,7 @@ class AMem:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
-        self._open.append([clip_text(" ".join(seen.state.split()), self.step_tokens, self._count), seen.line()])
+        self._open.append([excerpt(seen.state, self.step_tokens, self._count), seen.line()])
         if len(self._open) < self.every:
             return
         note = self._keep()

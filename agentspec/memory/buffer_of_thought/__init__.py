@@ -40,7 +40,7 @@ from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -170,7 +170,7 @@ class BufferOfThought:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
-        state = clip_text(" ".join(seen.state.split()), self.state_tokens, self._count)
+        state = excerpt(seen.state, self.state_tokens, self._count)
         self._course = [*self._course, [state, seen.line()]][-MOST_STEPS:]
 
     async def end_episode(self, trajectory: Trajectory) -> None:
@@ -184,7 +184,7 @@ class BufferOfThought:
 
     async def _begin(self, input: AgentInput) -> None:
         """Distil the task, and look up a way of working for it."""
-        state = clip_text(" ".join(input.text.split()), self.state_tokens, self._count)
+        state = excerpt(input.text, self.state_tokens, self._count)
         self._problem, self._looked_up = "", state
         if self.asks:
             prompt = (

@@ -46,7 +46,7 @@ from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Answer, Services
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, Task, Transition
 
@@ -228,7 +228,7 @@ class CamMemory:
         return [*self.levels[node.data["level"]].graph.neighbours(id), *children]
 
     async def _select(self, state: str, candidates: Sequence[int]) -> list[int] | None:
-        seen = SEEN.format(state=clip_text(one_line(state), self.step_tokens, self.services.llm.count_tokens))
+        seen = SEEN.format(state=excerpt(state, self.step_tokens, self.services.llm.count_tokens))
         listed = "\n".join(f"{i}. {self.shown(self.nodes[id])[2:]}" for i, id in enumerate(candidates))
         parse = json_of({"useful": list[int]}, repairs=self.repairs)
         prompt = (system(SELECT), user(f"{seen}\n\n{NOTES}\n{listed}"))
@@ -239,7 +239,7 @@ class CamMemory:
 
     def shown(self, node: Entry) -> str:
         """A node as it is shown: what it says, and of when it is."""
-        text = clip_text(one_line(node.text), self.node_tokens, self.services.llm.count_tokens)
+        text = excerpt(node.text, self.node_tokens, self.services.llm.count_tokens)
         until = "up to " if node.data["level"] else ""
         return f"- {text} [{until}{stamp(node.time, self.services.time())}]"
 

@@ -38,7 +38,7 @@ from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex, top_rows
 from agentspec.state import dump_state, load_state
 from agentspec.structured import ParseError, Parser
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 from agentspec.visible import visible
@@ -276,7 +276,7 @@ class DynamicCheatsheet:
         return "\n".join(lines).strip() or clip_text(sheet, room, self._count)
 
     def _state(self, text: str) -> str:
-        return clip_text(" ".join(text.split()), self.step_tokens, self._count)
+        return excerpt(text, self.step_tokens, self._count)
 
     def _count(self, text: str) -> int:
         return self.services.llm.count_tokens(text)

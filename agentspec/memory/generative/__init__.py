@@ -33,7 +33,7 @@ from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
-from agentspec.tokens import clip_text
+from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, Task, Transition
 
@@ -165,7 +165,7 @@ class GenerativeMemory:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
-        state = clip_text(" ".join(seen.state.split()), 4 * self.entry_tokens, self._count)
+        state = excerpt(seen.state, 4 * self.entry_tokens, self._count)
         event = Memory(self.services.new_id(), seen.line(), state, self.services.time().episode)
         self.stream.add(event, MIDDLE if self.rated else seen.reward, self.services.time().total)
         if self.rated:

@@ -149,7 +149,7 @@ class OpenClaw:
         least_queries: int = 2,
         promoted: int = 5,
         max_loss: float = 0.25,
-        state_tokens: int = 48,
+        state_tokens: int = 80,
         answer_tokens: int | None = None,
         steps_tokens: int | None = None,
     ) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from agentspec.memory.parts.telling import newest_that_fit
 from agentspec.services import Answer, Services, Time
-from agentspec.tokens import CountTokens, clip_text
+from agentspec.tokens import CountTokens, clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import Experience, Transition
 
@@ -25,7 +26,7 @@ def step_text(transition: Transition, state_tokens: int, count_tokens: CountToke
     e = Experience.of(transition)
     feedback = clip_text(" ".join(e.feedback.split()), FEEDBACK_TOKENS, count_tokens)
     reward = f" ({e.reward:+.2f})" if e.reward else ""
-    seen = clip_text(" ".join(e.state.split()), state_tokens, count_tokens) if state_tokens else ""
+    seen = excerpt(e.state, state_tokens, count_tokens) if state_tokens else ""
     return f"{e.action} {'->' if e.ok else 'failed:'} {feedback}{reward}" + (f" | in: {seen}" if seen else "")
 
 
@@ -39,18 +40,9 @@ def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) 
 
     Of a single text that is too long the beginning is kept.
     """
-    kept: list[str] = []
-    left = tokens
-    for text in reversed(texts):
-        cost = count_tokens(text) + 1
-        if cost > left:
-            break
-        kept.append(text)
-        left -= cost
-    if texts and not kept:
-        kept = [clip_text(texts[-1], tokens, count_tokens)]
+    kept = newest_that_fit(texts, tokens, count_tokens)
     gone = len(texts) - len(kept)
-    return ([f"({gone} earlier steps are left out)"] if gone else []) + kept[::-1]
+    return ([f"({gone} earlier steps are left out)"] if gone else []) + kept
 
 
 def first_held(services: Services, step: int) -> int:

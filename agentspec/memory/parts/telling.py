@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from agentspec.reading import read
-from agentspec.tokens import CountTokens, clip_text
+from agentspec.tokens import CountTokens, clip_text, excerpt
 from agentspec.types import MIN_CLIPPED, Action, Experience, Recall, RecallItem, Transition
 from agentspec.visible import visible
 
@@ -49,8 +49,9 @@ def course(steps: Sequence[Sequence[str]], tokens: int, count_tokens: CountToken
     waiting = sum(bool(state) for state, _ in steps)
     for state, line in steps:
         if state:
-            clipped = clip_text(f"State: {state}", left // waiting - 1, count_tokens)
-            if count_tokens(clipped) >= MIN_CLIPPED or clipped.endswith(state):
+            part = excerpt(state, left // waiting - 1 - count_tokens("State: "), count_tokens)
+            clipped = f"State: {part}" if part else ""
+            if count_tokens(clipped) >= MIN_CLIPPED or part == state:
                 shown.append(clipped)
                 left -= count_tokens(clipped) + 1
             waiting -= 1
