@@ -105,12 +105,13 @@ class MemoryBank:
         """
         try:
             data = json.loads(blob)
-            if data["kind"] != KIND:
-                raise KeyError("kind")
-        except (ValueError, KeyError, TypeError) as error:
+        except ValueError:
+            data = None
+        if not isinstance(data, dict) or data.get("kind") != KIND:
             raise ValueError(
-                f"not a memory file ({type(error).__name__}: {error}); give one that a run wrote"
-            ) from error
+                f"not a memory file; give the {FILE} of a training run, or the .{FILE} beside a file that "
+                "`agentspec run --out` wrote for an agent with `scope: run`"
+            )
         if data["format"] != FORMAT:
             raise ValueError(
                 f"a memory file of format {data['format']}, this version reads {FORMAT}; grow the memory again"

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -185,6 +186,11 @@ class AgentSpec:
         """YAML text of :meth:`to_data`."""
         return yaml.safe_dump(self.to_data(), sort_keys=False)
 
+    def with_base(self, model: str) -> AgentSpec:
+        """The spec with helper models that are an adapter alone put on `model`, the policy's own."""
+        roles = {k: v if {*v} & {"model", "script"} else {**v, "model": model} for k, v in self.roles.items()}
+        return self if roles == self.roles else dataclasses.replace(self, roles=roles)
+
     @property
     def label(self) -> str:
         """Short name for tables: ``react+base``, with reflection and layout where they are not the default."""
@@ -338,6 +344,11 @@ def load_yaml(source: str | Path) -> Any:
         text, where = path.read_text(encoding="utf-8"), str(path)
     else:
         where = "the given text"
+    if text.lstrip()[:1] in ("{", "["):
+        try:
+            return json.loads(text)  # YAML reads JSON too, except for numbers such as 1e-4
+        except ValueError:
+            pass
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:

@@ -24,8 +24,8 @@ from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.llm.pricing import Prices
 from agentspec.metrics import episode_row
-from agentspec.policies import Policy
-from agentspec.progress import episode_progress
+from agentspec.policies import Policy, check_agent
+from agentspec.progress import episode_progress, load_policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.tasks import Tasks, task_sets
@@ -183,7 +183,7 @@ def evaluate(
 
     for row in playing:
         if row:
-            llm = (make_llm or Policy.build)(row[0].policy)
+            llm = (make_llm or load_policy)(row[0].policy)
             asyncio.run(_play(row, llm, settings, make_env, finished))
             del llm
             gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles
@@ -308,15 +308,15 @@ def _check_first(
     make_llm: MakeLLM | None,
     make_env: MakeEnv,
 ) -> None:
-    """Find every model and make one environment of each kind: what is missing shows before hours of work, not after."""
+    """Make one environment of each kind and check every agent: what is missing shows before hours of work, not after."""
     if not any(playing):
         return
-    if make_llm is None:
-        for row in playing:
-            if row:
-                row[0].policy.check()
     for task in {replace(t, seed=0).key: t for members in sets.values() for t in members}.values():
-        make_env(task).close()
+        env = make_env(task)
+        for setting in (s for row in playing for s in row):
+            if make_llm is None:
+                check_agent(setting.policy, setting.spec, env, task.env)
+        env.close()
 
 
 def _trajectory_path(folder: Path, setting: Setting, trajectory: Trajectory) -> Path:

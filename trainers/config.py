@@ -7,16 +7,15 @@ or would not be exact is refused at start, with the reason and the remedy (`trai
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from trl import GRPOConfig
 
 from agentspec.carry import start_bank
+from agentspec.llm.models import base_of
 from agentspec.registry import SpecError
-from agentspec.spec import AgentSpec
+from agentspec.spec import AgentSpec, load_yaml
 from rewards import RewardSet
 from trainers.checks import check
 from trainers.credit import CreditRule
@@ -142,7 +141,7 @@ class ScaffoldConfig(GRPOConfig):
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
             value = getattr(self, name)
             if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
-                setattr(self, name, _json(name, value))
+                setattr(self, name, load_yaml(value))
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -155,7 +154,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def spec(self) -> AgentSpec:
         """The training scaffold."""
-        return agent_spec(self.agent)
+        return agent_spec(self.agent).with_base(base_of(self.model))
 
     @property
     def credit_rule(self) -> CreditRule:
@@ -230,11 +229,3 @@ def agent_spec(value: Any) -> AgentSpec:
 
 def _listed(specs: list[Any] | str) -> list[Any]:
     return [specs] if isinstance(specs, str) else list(specs)
-
-
-def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:
-    try:
-        data: Mapping[str, Any] | list[Any] = json.loads(text)
-    except ValueError as error:
-        raise SpecError(f"{name}: not valid JSON ({error}); quote keys and strings with double quotes") from error
-    return data

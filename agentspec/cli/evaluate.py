@@ -12,6 +12,7 @@ from typing import Any
 from agentspec.cli.arguments import (
     add_environment,
     add_model,
+    at_least,
     environment_options,
     key_values,
     labelled_spec,
@@ -51,9 +52,9 @@ def add_parser(commands: Any) -> None:
         metavar="SEEDS",
         help="task seeds such as 0-15 or 0,4,8 (default: %(default)s, held out from training)",
     )
-    group.add_argument("--rollouts", type=int, default=1, metavar="N", help="episodes per task")
-    group.add_argument("--seed", type=int, default=0, help="seed of the agents' own draws")
-    group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group.add_argument("--rollouts", type=at_least(1), default=1, metavar="N", help="episodes per task")
+    group.add_argument("--seed", type=at_least(0), default=0, metavar="N", help="seed of the agents' own draws")
+    group.add_argument("--concurrency", type=at_least(1), metavar="N", help="most episodes at once (default: all)")
     group.add_argument(
         "--start-memory",
         nargs="+",

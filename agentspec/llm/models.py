@@ -19,6 +19,7 @@ import os
 import re
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -104,8 +105,8 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     if (folder / "config.json").is_file():
         return ModelSource(str(folder), folder.resolve().name)
     if (folder / "adapter_config.json").is_file():
-        base = json.loads((folder / "adapter_config.json").read_text(encoding="utf-8")).get("base_model_name_or_path")
-        if not base:
+        base = base_of(name)
+        if base == name:
             raise ModelNotFoundError(
                 f"the adapter {folder} does not say which model it belongs to; give the base model as `model` and this "
                 "folder as `adapter`"
@@ -119,6 +120,14 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
             "written by `save_pretrained`"
         )
     return _hub(name)
+
+
+def base_of(name: str) -> str:
+    """The model that ``name`` is, or, where it is the folder of an adapter, stands on."""
+    config = Path(name).expanduser() / "adapter_config.json"
+    if not config.is_file() or (config.parent / "config.json").is_file():
+        return name
+    return str(json.loads(config.read_text(encoding="utf-8")).get("base_model_name_or_path") or name)
 
 
 def resolve_adapter(name: str | os.PathLike[str]) -> str:
@@ -259,9 +268,13 @@ def _verify(folder: Path) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without progress bars: converting takes seconds and says nothing of use."""
+    """Without progress bars while a model loads, and from then on without the deprecations between libraries.
+
+    Those come back at every checkpoint and with every adapter, and nobody who runs or trains could change anything.
+    """
     from transformers.utils import logging
 
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(transformers|trl|peft|accelerate|datasets)\b")
     shown: Any = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
