@@ -308,7 +308,7 @@ def _check_first(
     make_llm: MakeLLM | None,
     make_env: MakeEnv,
 ) -> None:
-    """Make one environment of each kind and check every agent: what is missing shows before hours of work, not after."""
+    """Make one environment of each kind and check every agent: what is missing shows before hours of work."""
     if not any(playing):
         return
     for task in {replace(t, seed=0).key: t for members in sets.values() for t in members}.values():

@@ -8,16 +8,14 @@ continues from the last checkpoint. On a GPU machine only the config changes (`q
 
 from __future__ import annotations
 
-from recipes.common import CONFIGS, draw_curve, run_recipe
+from recipes.common import CONFIGS, run_recipe, train_and_draw
 
 
 def main() -> None:
     """Train, save the adapter, draw the reward curve."""
     from trainers.arguments import parse_config
-    from trainers.run import train
 
-    config = parse_config(default=CONFIGS / "quickstart_cpu.yaml")
-    draw_curve(config, train(config))
+    train_and_draw(parse_config(default=CONFIGS / "quickstart_cpu.yaml"))
 
 
 if __name__ == "__main__":

@@ -12,15 +12,13 @@ from collections.abc import Collection, Iterable
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args
 
-from trl import GRPOConfig
-
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
-from trainers.fields import field_rules
+from trainers.fields import REFUSED, field_rules
 from trainers.losses import LOSSES, loss
 from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.writes import write_credit
@@ -59,11 +57,13 @@ def check(config: ScaffoldConfig) -> None:
 
 def check_fields(config: Any) -> None:
     """No field of TRL's that nobody reads has a value of its own."""
-    rules = field_rules(GRPOConfig)
-    for name, rule in rules.items():
+    from trl import GRPOConfig
+
+    for name, rule in field_rules(GRPOConfig).items():
         value = getattr(config, name, rule.allowed[0] if rule.allowed else None)
         if rule.status != "used" and value not in rule.allowed:
-            _refuse_field(name, value)
+            verb = "is not read" if rule.status == "refused" else f"must be {rule.allowed[0]!r}"
+            raise SpecError(f"{name} is {value!r}, and it {verb}: {rule.why}")
     if (
         config.max_completion_length != _default(config, "max_completion_length")
         and "max_completion_length" not in loss(config.loss_type).uses
@@ -81,16 +81,10 @@ def check_given(names: Iterable[str], where: str) -> None:
         names: keys of a YAML file, or options of a command line.
         where: what they were read from, for the message.
     """
-    rules = field_rules(GRPOConfig)
+    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
     for name in names:
-        if name in rules and rules[name].status == "refused":
-            raise SpecError(f"{where}: `{name}` is not read: {rules[name].why}")
-
-
-def _refuse_field(name: str, value: Any) -> None:
-    rule = field_rules(GRPOConfig)[name]
-    verb = "is not read" if rule.status == "refused" else f"must be {rule.allowed[0]!r}"
-    raise SpecError(f"{name} is {value!r}, and it {verb}: {rule.why}")
+        if name in why:
+            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:

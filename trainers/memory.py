@@ -7,8 +7,12 @@ in what follows from it.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from agentspec.registry import SpecError
-from trainers.config import ScaffoldConfig
+
+if TYPE_CHECKING:
+    from trainers.config import ScaffoldConfig
 
 PATTERN = "memory.*"
 

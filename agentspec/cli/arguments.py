@@ -66,7 +66,11 @@ def add_environment(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--max-steps", type=at_least(1), metavar="N", help="most steps of an episode")
     group.add_argument(
-        "--timeout", type=above(0), default=60.0, metavar="S", help="seconds per environment call (default: %(default)s)"
+        "--timeout",
+        type=above(0),
+        default=60.0,
+        metavar="S",
+        help="seconds per environment call (default: 60)",
     )
 
 

@@ -22,7 +22,7 @@ def add_parser(commands: Any) -> None:
         ),
     )
     parser.add_argument("run", metavar="RUN", help="folder of the run (its output_dir)")
-    parser.add_argument("--step", type=at_least(0), metavar="N", help="only the update of this optimiser step (default: all)")
+    parser.add_argument("--step", type=at_least(0), metavar="N", help="only the update of this step (default: all)")
     parser.add_argument(
         "--head", default="", metavar="DIGEST", help="head of the chain, as the run printed it when it ended"
     )

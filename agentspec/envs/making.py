@@ -59,7 +59,7 @@ def make_env(task: Task) -> Any:
     from agentspec.envs.generic import adapted
 
     name = environment_id(task.env)
-    _check_options(name, task.options)
+    check_options(name, task.options)
     try:
         env = gymnasium.make(name, disable_env_checker=True, **task.options)
     except TypeError as error:
@@ -69,7 +69,7 @@ def make_env(task: Task) -> Any:
     return adapted(env, name)
 
 
-def _check_options(name: str, options: Mapping[str, Any]) -> None:
+def check_options(name: str, options: Mapping[str, Any]) -> None:
     """Refuse options that nobody takes, and of our own environments those of another type.
 
     Raises:

@@ -31,8 +31,8 @@ def check_helper(where: str, config: Any) -> None:
     named = isinstance(config, Mapping) and all(isinstance(config[k], str) for k in FORMS if k in config)
     if not named or not {*config} & {"model", "adapter", "script"}:
         raise SpecError(
-            f"{where}: expected {{model: NAME}}, {{model: NAME, adapter: FOLDER}}, {{adapter: FOLDER}} (on the policy's "
-            f"model) or {{endpoint: URL, model: NAME}}, got {config!r}"
+            f"{where}: expected {{model: NAME}}, {{model: NAME, adapter: FOLDER}}, {{adapter: FOLDER}} (on the "
+            f"policy's model) or {{endpoint: URL, model: NAME}}, got {config!r}"
         )
     if "endpoint" in config and "adapter" in config:
         raise SpecError(f"{where}: an endpoint serves adapters under model names of their own; leave `adapter` out")
@@ -65,7 +65,7 @@ def helper(config: Mapping[str, Any]) -> LLM:
     key = json.dumps(config, sort_keys=True, default=str)
     if key not in _LOADED:
         if "model" not in config and "script" not in config:
-            raise SpecError(f"helper model {dict(config)}: it names no model, and whoever plays did not say the policy's")
+            raise SpecError(f"helper model {dict(config)} names no model, and there is no policy's to put it on")
         try:
             _LOADED[key] = build_llm(_settings(config))
         except ValueError as error:

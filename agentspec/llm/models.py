@@ -122,6 +122,17 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     return _hub(name)
 
 
+def check_name(name: str) -> None:
+    """Refuse a name that is no model here and cannot be one of the hub's; asks no network and converts nothing.
+
+    Raises:
+        ModelNotFoundError: as `resolve`.
+    """
+    bundled = BUNDLED.get(name.casefold())
+    if (bundled is None or bundled.find() is None) and not _HUB_ID.fullmatch(name):
+        resolve(name)
+
+
 def base_of(name: str) -> str:
     """The model that ``name`` is, or, where it is the folder of an adapter, stands on."""
     config = Path(name).expanduser() / "adapter_config.json"
