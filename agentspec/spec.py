@@ -288,7 +288,7 @@ class AgentSpec:
                 modules[kind] = cls(*arguments, **spec.params)
             except SpecError:
                 raise
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise SpecError(f"{kind} {spec.name!r}: {error}") from error
         return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
 
@@ -302,6 +302,8 @@ class AgentSpec:
     def _check_roles(self) -> None:
         """Refuse roles of no module, and backends that say neither what nor where."""
         for pattern, backend in self.roles.items():
+            if not isinstance(pattern, str):
+                raise SpecError(f"roles: expected a pattern over module names such as 'memory.*', got {pattern!r}")
             if not self.helped(pattern):
                 modules = ", ".join(self._modules())
                 raise SpecError(f"roles: {pattern!r} matches none of the modules {modules}")

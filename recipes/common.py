@@ -36,8 +36,13 @@ def train_and_draw(config: Any, **how: Any) -> Any:
         from eval.plots import reward_curve
         from trainers.run_folder import METRICS
 
-        reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png")
+        reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png", unit=unit(config))
     return trainer
+
+
+def unit(config: Any) -> str:
+    """What a reward is, as a formula: `1 x earning_delta`."""
+    return " + ".join(f"{weight:g} x {name}" for name, weight in config.reward_set.weights.items())
 
 
 def run_recipe(main: Callable[[], None]) -> None:

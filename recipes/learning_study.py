@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recipes.common import CONFIGS, run_recipe
+from recipes.common import CONFIGS, run_recipe, unit
 
 if TYPE_CHECKING:
     from eval.statistics import Estimate
@@ -112,7 +112,7 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     own = {method: c.spec.label for method, c in configs.items()}
     write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
     logs = {m: [RunLog(f).read(METRICS) for f in folders.values()] for m, folders in runs.items()}
-    learning_curves(logs, out / "curves.png")
+    learning_curves(logs, out / "curves.png", unit=unit(config))
     print((out / "study.md").read_text())
 
 

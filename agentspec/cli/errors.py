@@ -5,6 +5,7 @@ Shared by the command line and the recipes, so that a mistyped name reads the sa
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,6 +37,8 @@ EXTRAS = {
     "safetensors": "train",
     "gguf": "train",
     "matplotlib": "train",
+    "scipy": "eval",
+    "statsmodels": "eval",
     "httpx": "openai",
     "minigrid": "minigrid",
     "tensorboard": "tensorboard",
@@ -92,6 +95,17 @@ def one_line(error: BaseException | str) -> str:
     else:
         text = str(error) or type(error).__name__
     return " ".join(text.split())
+
+
+def require(*packages: str) -> None:
+    """Refuse to begin what would end without one of `packages`.
+
+    Raises:
+        ModuleNotFoundError: naming the first that is missing; `fail` says what installs it.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
 
 
 def _package(error: ModuleNotFoundError) -> str:

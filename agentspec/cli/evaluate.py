@@ -20,6 +20,7 @@ from agentspec.cli.arguments import (
     parse_policy,
     parse_seeds,
 )
+from agentspec.cli.errors import require
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
@@ -82,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     from eval.matrix import Settings, evaluate
     from eval.tables import markdown, summarise, write_report
 
+    require("scipy", *(["matplotlib"] if arguments.plot else []))  # for the report at the end
     settings = Settings(
         rollouts=arguments.rollouts,
         seed=arguments.seed,

@@ -71,7 +71,7 @@ def capabilities_of(config: Mapping[str, Any]) -> frozenset[str]:
 def _prepared(config: Mapping[str, Any]) -> tuple[Callable[..., Any], Any, dict[str, Any]]:
     """What makes the backend, its main argument, and the others: all of them known, and of the right type."""
     backend = config.get("backend", "local")
-    if backend not in _BACKENDS:
+    if not isinstance(backend, str) or backend not in _BACKENDS:
         raise ValueError(f"unknown llm backend {backend!r}{suggest(str(backend), _BACKENDS)}")
     module, path, main, packages, extra = _BACKENDS[backend]
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
