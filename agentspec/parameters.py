@@ -57,7 +57,7 @@ def parameters_of(target: Any) -> list[str]:
 def check_parameters(where: str, target: Any, params: Mapping[str, Any]) -> None:
     """Refuse parameters that a class does not take, or takes as another type, and numbers that mean nothing.
 
-    No number is NaN, no `*tokens` is negative, no `*temperature` negative or infinite; other ranges are the class's own.
+    No number is NaN, no `*tokens` is negative, no `*temperature` negative or infinite; other ranges are the class's.
 
     Raises:
         SpecError: naming the parameter, with the nearest known ones or the type expected.

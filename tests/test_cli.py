@@ -47,6 +47,17 @@ if DRAWN not in gymnasium.registry:
     gymnasium.register(DRAWN, entry_point=DrawnEnv)
 
 
+class ForgetfulEnv(ToyEnv):
+    """The toy without snapshots."""
+
+    snapshot = None  # type: ignore[assignment]
+
+
+FORGETFUL = "agentspec-test/Forgetful-v0"
+if FORGETFUL not in gymnasium.registry:
+    gymnasium.register(FORGETFUL, entry_point=ForgetfulEnv)
+
+
 def prices(seed: int) -> list[int]:
     env = ToyEnv()
     env.reset(seed=seed)
@@ -319,7 +330,7 @@ LATE = {
         ["--spec", "{memory: summary, roles: {'memory.*': {adapter: none}}}"],
         "none is no",
     ),
-    "no snapshots": (["--spec", "reasoning: lats", "--env", TOY], "snapshots"),
+    "no snapshots": (["--spec", "reasoning: lats", "--env", FORGETFUL], "snapshots"),
 }
 
 
@@ -339,7 +350,7 @@ def test_what_cannot_work_is_told_before_the_model_loads(
     options = [o.replace("--spec", "--specs") if command == "eval" else o for o in options]
     who = ["--policies" if command == "eval" else "--policy", str(tmp_path)]
     out = ["--out", str(tmp_path / "out")]
-    assert message in refused(capsys, command, *([] if TOY in options else ["--env", TOY]), *who, *out, *options)
+    assert message in refused(capsys, command, *([] if FORGETFUL in options else ["--env", TOY]), *who, *out, *options)
 
 
 def test_view_prints_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

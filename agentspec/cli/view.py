@@ -158,7 +158,7 @@ def _check_kind(path: Path) -> None:
         line = file.readline(1 << 26)
     try:
         data = json.loads(line)
-        if isinstance(data, dict) and {"task", "transitions"} <= data.keys():
+        if isinstance(data, dict) and {"task", "steps"} <= data.keys():
             return
         memory = isinstance(data, dict) and data.get("kind") == KIND
     except ValueError:
