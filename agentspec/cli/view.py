@@ -9,10 +9,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from agentspec.carry import KIND
+from agentspec.carry import KIND, read_bank
 from agentspec.cli.arguments import at_least
 from agentspec.files import write_atomic
-from agentspec.memory_text import data, diff, read_bank, text
+from agentspec.memory_text import data, diff, text
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Transition
