@@ -239,7 +239,7 @@ class Runner:
         except Exception as error:  # whatever a module does with a state that is not its own
             modules = f"memory {self.spec.memory.name!r} and reflection {self.spec.reflection.name!r}"
             raise SpecError(
-                f"the carried state cannot be taken up by {modules} ({type(error).__name__}: {error}); was it edited, or "
+                f"the carried state cannot be taken up by {modules} ({type(error).__name__}: {error}); was it "
                 "edited, or written by another version? grow the memory again"
             ) from error
 
