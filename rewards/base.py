@@ -106,9 +106,13 @@ class RewardSet:
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
+        if not isinstance(weights, Mapping | None):
+            raise SpecError(f"rewards: expected {{name: weight}}, got {weights!r}")
         self.weights = dict(weights or {"earning_delta": 1.0})
         for name, weight in self.weights.items():
-            if not math.isfinite(weight):
+            if not isinstance(name, str):
+                raise SpecError(f"rewards: expected the name of a reward, got {name!r}")
+            if not isinstance(weight, int | float) or not math.isfinite(weight):
                 raise SpecError(f"reward {name!r} has weight {weight}; expected a finite number")
         self._functions = {name: reward_entry(name).load() for name in self.weights}
 

@@ -64,8 +64,7 @@ def check_ahead(data: Mapping[str, Any], options: Sequence[str]) -> None:
         for spec in value if isinstance(value, list) else [value] if value else []:
             AgentSpec.from_yaml(spec) if isinstance(spec, str) else AgentSpec.from_data(spec)
     check_world(fields.get("environment") or "deliverybench")
-    if isinstance(fields.get("rewards"), dict):
-        RewardSet(fields["rewards"])
+    RewardSet(fields.get("rewards"))
     for name, known in (("estimator", estimator), ("loss_type", loss)):
         if isinstance(fields.get(name), str):
             known(fields[name])
