@@ -94,7 +94,7 @@ class LiveTable(Observer):
         """Leave the last state on the screen."""
         if self._screen is not None:
             self._screen.stop()
-        elif self.counts:
+        elif self.played:
             self._say(self.line())
 
     def line(self) -> str:
