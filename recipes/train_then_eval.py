@@ -13,7 +13,7 @@ from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
-    """Train, draw the reward curve, evaluate, write `evaluation.md` and `evaluation.jsonl`."""
+    """Train, draw the reward curve, evaluate, write `evaluation.md` and the episodes under `evaluation/`."""
     from trainers.arguments import parse_config
     from trainers.run import train
 
