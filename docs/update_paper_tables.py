@@ -35,7 +35,9 @@ def _folded(text: str) -> str:
 
 
 def _filled(text: str) -> str:
-    return textwrap.fill(" ".join(text.split()), 118, subsequent_indent="  " if text.startswith("- ") else "")
+    return textwrap.fill(
+        " ".join(text.split()), 118, break_on_hyphens=False, subsequent_indent="  " if text.startswith("- ") else ""
+    )
 
 
 def _intro() -> str:

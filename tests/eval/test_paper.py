@@ -18,7 +18,7 @@ def test_every_number_of_the_file_is_read_and_known_ones_are_right() -> None:
     rl = paper.table("rl_combined", policy="grpo")
     assert rl["Qwen3-4B-Instruct", ("react", "base", "none")] == 5.62
     counts = [n.value for n in paper.numbers() if n.metric == "goal_conditions"]
-    assert all(0 <= value <= 1 for value in counts) and 2 / 3 in counts  # `2/3` is a share
+    assert all(0 <= value <= 1 for value in counts) and 1 / 3 in counts  # `1/3` is a share
     with pytest.raises(ValueError, match="no table 'rl'; there are"):
         paper.table("rl")
 
