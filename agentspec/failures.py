@@ -3,7 +3,7 @@
 A rule gives a `Sign` only where the record proves it: a text that is no action, an action that failed and was written
 again, a battery that ran empty. What holds in every world stands here; what only a world can know stands in its folder
 (`signs.py`), which its class names: `failure_signs = "package.module:function"`, called with the trajectory. A failure
-without a sign is left open: a reader (or a model, `eval.failures`) has to judge it.
+without a sign is left open: a reader, or a model, has to judge it.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def test_texts_that_are_no_action() -> None:
     found = leaves(COURIER, "FLY()", "MOVE(x='far')", "VIEW_ORDERS()")
     assert found == [("parse/action_interface/hallucination", 0), ("parse/action_interface/parameter", 1)]
     first = replayed(EMPTY, ["TURN_LEFT()"]).transitions[0]
-    assert leaves(EMPTY, "TURN_LEFT()", first.input.text[:300])[-1] == ("parse/unstructured_memory", 1)
+    assert leaves(EMPTY, "TURN_LEFT()", first.next_text[:300])[-1] == ("parse/unstructured_memory", 1)
 
 
 def test_an_action_that_fails_again_for_the_same_reason() -> None:
