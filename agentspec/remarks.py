@@ -37,8 +37,8 @@ _NEXT_LINE_BACK = re.compile(
     re.IGNORECASE,
 )
 _MEANT = re.compile(
-    r"\b(?:choos(?:e|ing)|chose|pick(?:ing)?|select(?:ing)?|go(?:ing)? (?:with|for)|opt(?:ing)? for|decid(?:e|ed) (?:on|to)|"
-    r"will|shall|let me|let us|let's|should|must|going to|recommend|suggest|propose|answer|"
+    r"\b(?:choos(?:e|ing)|chose|pick(?:ing)?|select(?:ing)?|go(?:ing)? (?:with|for)|opt(?:ing)? for|"
+    r"decided? (?:on|to)|will|shall|let me|let us|let's|should|must|going to|recommend|suggest|propose|answer|"
     r"(?:action|choice|step|move|option|thing)(?: \w+){0,3} (?:is|:)|best)\b|'ll\b|’ll\b",
     re.IGNORECASE,
 )

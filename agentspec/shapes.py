@@ -125,7 +125,7 @@ def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  #
         return None
     if isinstance(data, list):
         if isinstance(data[0], str) and depth:
-            name = known_name(data[0], schema)
+            name = None if data[0] in schema.choices else known_name(data[0], schema)
             if name is not None:
                 return _build(name, data[1:] if not isinstance(data[-1], str) else [], schema)
             return data[0] if "(" in data[0] or data[0] in schema.choices else None

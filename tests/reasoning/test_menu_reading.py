@@ -43,7 +43,8 @@ NOT_MEANT = (
     "Action: accept order 2 and 5", "go to car dealer", "accept order 123",
     # A choice that is left open.
     "accept order 2 or order 5", "go to car rental or rent car", "hurry to restaurant 4 / go to restaurant 4",
-    "wait 1 minute if the food is not ready, otherwise pick up order 3", "rent car; hurry to restaurant 4; wait 1 minute",
+    "wait 1 minute if the food is not ready, otherwise pick up order 3",
+    "rent car; hurry to restaurant 4; wait 1 minute",
     "Rent car. It costs $1 a minute but is fast.\nWait 1 minute. It costs nothing.\nI would look at the others first.",
     # Taken back.
     "Rent car. Too expensive.", "rent car - no, hurry to restaurant 4 instead", "rent car (not worth it)",
