@@ -163,8 +163,12 @@ def interquartile_mean(values: Values, *, level: float = LEVEL, resamples: int =
 
 
 def performance_profile(values: Values, thresholds: Values) -> list[float]:
-    """Share of `values` above each threshold (Dolan and More, 2002; Agarwal et al., 2021)."""
-    data = np.asarray(values, dtype=np.float64)
+    """Share of `values` above each threshold (Dolan and More, 2002; Agarwal et al., 2021); NaN of no values.
+
+    Raises:
+        ValueError: a value that is not finite.
+    """
+    data = _finite(values, LEVEL)
     return [float(np.mean(data > threshold)) if data.size else math.nan for threshold in thresholds]
 
 
