@@ -20,7 +20,7 @@ from agentspec.episode import MakeEnv, make_env
 from agentspec.files import write_lines
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
-from agentspec.spec import AgentSpec
+from agentspec.spec import MODULE_KINDS, AgentSpec
 from agentspec.tasks import Tasks, task_sets
 from agentspec.types import Task
 from eval.cells import Cell, CellName, Planned, Settings, plan_cell
@@ -190,13 +190,19 @@ def rows_of_cell(cell: Cell, store: Store, settings: Settings, problem: str = ""
 def row_of(cell: Cell, planned: Planned, record: Record | None) -> dict[str, Any]:
     """A row of results: names of the cell, then the episode."""
     policy, run, scaffold = cell.name
-    names = {"policy": policy, "run": run, "scaffold": scaffold, "tasks": planned.tasks}
+    names = {"policy": policy, "run": run, "scaffold": scaffold, "tasks": planned.tasks, "agent": agent_of(cell.spec)}
     task = planned.job.task
     if record is None:
         unplayed = {"env": task.env, "task": task.key, "seed": task.seed, "options": dict(task.options)}
         return names | unplayed | {"rollout": planned.job.rollout, "status": UNPLAYED, "error": "", "ended": ""}
     kept = {name: record[name] for name in ("key", "configuration", "wall_s", "trajectory") if name in record}
     return names | kept | record["episode"]
+
+
+def agent_of(spec: AgentSpec) -> dict[str, str]:
+    """What an agent is made of, by name."""
+    modules = {kind: getattr(spec, kind).name for kind in MODULE_KINDS}
+    return modules | {"layout": spec.layout, "scope": spec.scope}
 
 
 def _missing(cell: Cell, store: Store, settings: Settings) -> list[str]:

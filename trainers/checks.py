@@ -192,7 +192,10 @@ def unread(config: ScaffoldConfig) -> dict[str, str]:
 def check_calls(config: ScaffoldConfig) -> None:
     """Something is trained, and sampled so that it can be."""
     spec, paths = config.spec, config.spec.call_paths()
-    for name, train in (("train_calls", config.train_filter), ("mask_truncated", TrainFilter((*config.mask_truncated,)))):
+    for name, train in (
+        ("train_calls", config.train_filter),
+        ("mask_truncated", TrainFilter((*config.mask_truncated,))),
+    ):
         if missing := unmatched_patterns(paths, train):
             raise SpecError(
                 f"{name} {missing} match no call of this scaffold, so nothing would come of them; its calls come from "

@@ -110,7 +110,9 @@ class SamplingMetrics:
         return metrics
 
 
-def _summary(values: Sequence[torch.Tensor], gather: Callable[[list[Any]], list[Any]]) -> tuple[float, dict[str, float]]:
+def _summary(
+    values: Sequence[torch.Tensor], gather: Callable[[list[Any]], list[Any]]
+) -> tuple[float, dict[str, float]]:
     """Over all ranks: the greatest value, NaN if any is; `min`, `mean` and `max` of those that are not (0 of none)."""
     flat = torch.cat([v.detach().double().cpu() for v in values])
     known = flat[~flat.isnan()]

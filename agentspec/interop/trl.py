@@ -127,9 +127,7 @@ def _tool(spec: ActionSpec, schema: ActionSchema) -> Callable[..., str]:
     for name, parameter in needed_first:
         default = inspect.Parameter.empty if parameter.required else parameter.default
         inputs.append(
-            inspect.Parameter(
-                name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kinds[name]
-            )
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kinds[name])
         )
     tool.__signature__ = inspect.Signature(inputs, return_annotation=str)  # type: ignore[attr-defined]
     tool.__annotations__ = {**kinds, "return": str}

@@ -126,7 +126,9 @@ class ScaffoldHarness(vf.Harness[ScaffoldConfig]):
             HarnessError: a task that is not a `WorldTaskset`'s.
         """
         if not isinstance(data, WorldData):
-            raise vf.HarnessError(f"the harness {self.config.id!r} plays tasks of agentspec-verifiers, got {type(data)}")
+            raise vf.HarnessError(
+                f"the harness {self.config.id!r} plays tasks of agentspec-verifiers, got {type(data)}"
+            )
         spec = AgentSpec.from_yaml(self.config.scaffold) if self.config.scaffold else AgentSpec()
         llm = OpenAILLM(ctx.model, base_url=endpoint, api_key=secret, max_retries=0)
         try:
