@@ -183,6 +183,13 @@ def show(estimate: Estimate | None, digits: int) -> str:
     return f"{mean} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 
+def show_p(p: float | None) -> str:
+    """`0.012`; `<0.001` below that, a dash where there is none."""
+    if p is None or math.isnan(p):
+        return "–"
+    return f"{p:.3f}" if p >= 0.001 else "<0.001"
+
+
 def _grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -226,7 +233,7 @@ def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
     for row in rows:
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        p = "–" if row["p"] is None else f"{row['p']:.3f}"
+        p = show_p(row["p"])
         verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
         counted = f"{row['n']} {row['unit']}s"
         body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, counted])

@@ -23,7 +23,7 @@ from eval.report import figures
 from eval.report.blocks import Block, Figure, Heading, Table, Text, to_html, to_latex, to_markdown
 from eval.report.sections import failures_section, learning_section, paper_section
 from eval.statistics import Estimate, interactions, minimum_detectable_effect, runs_mean
-from eval.tables import DIFFERENCES, differences, show, summarise, values_by_run
+from eval.tables import DIFFERENCES, differences, show, show_p, summarise, values_by_run
 
 Row = Mapping[str, Any]
 LEVEL = 0.95
@@ -115,7 +115,7 @@ def _overview(rows: Sequence[Row], path: Path) -> list[Block]:
         body.append([policy, str(len(runs)), str(len({r["task"] for r in mine})), str(len(mine))])
     agents = []
     for scaffold in dict.fromkeys(row["scaffold"] for row in rows):
-        agent = next((r["agent"] for r in rows if r["scaffold"] == scaffold and _acts(r)), {})
+        agent: Mapping[str, str] = next((r["agent"] for r in rows if r["scaffold"] == scaffold and _acts(r)), {})
         agents.append(
             [scaffold, *(str(agent.get(k, "–")) for k in ("reasoning", "memory", "reflection", "layout", "scope"))]
         )
@@ -183,7 +183,7 @@ def _difference_table(compared: Sequence[Mapping[str, Any]], by: str, metric: Me
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high", "p")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
         verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
-        p = "–" if math.isnan(numbers[3]) else f"{numbers[3]:.3f}"
+        p = show_p(numbers[3])
         counted = f"{row['n']} {row['unit']}s"
         body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, metric.digits), p, verdict, counted])
     caption = f"Differences in {metric.heading}, by {by}: {DIFFERENCES}."
@@ -283,7 +283,7 @@ def _interactions(rows: Sequence[Row], metric: Metric) -> list[Block]:
     except ValueError as error:
         return [Text(f"Interactions are not estimated: {error}.")]
     body = [
-        [f"{a} x {b}", show(e, metric.digits), f"{e.p:.3f}", "tie" if e.tie() else "interaction"]
+        [f"{a} x {b}", show(e, metric.digits), show_p(e.p), "tie" if e.tie() else "interaction"]
         for (a, b), e in found.items()
     ]
     caption = (
