@@ -18,8 +18,9 @@ def decoder_of(model: str) -> Decode | None:
     if model.startswith("scripted"):
         return ByteTokenizer().decode
     try:
-        from agentspec.llm.models import resolve
         from transformers import AutoTokenizer
+
+        from agentspec.llm.models import resolve
 
         folder: Any = resolve(model, None)
         tokenizer = AutoTokenizer.from_pretrained(str(folder.path))

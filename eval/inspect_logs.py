@@ -358,8 +358,9 @@ def _pictures(t: Trajectory) -> dict[int, str]:
     import io
     from dataclasses import replace
 
-    from agentspec.envs.making import make_env
     from PIL import Image
+
+    from agentspec.envs.making import make_env
 
     try:
         env = make_env(replace(t.task, options={**t.task.options, "render_mode": "rgb_array"}))
