@@ -20,7 +20,6 @@ from tests.reasoning.numbers_env import NUMBERS, ONE_WAY, NumbersEnv
 from tests.reasoning.player import OPERATIONS, credits_of, last, named, play, purposes, seen, solved
 from tests.reasoning.test_rap import imaginer
 
-
 THOUGHT = "Smaller numbers double better."
 
 
