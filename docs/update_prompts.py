@@ -122,7 +122,7 @@ def page(name: str, spec: dict[str, Any]) -> str:
 
 def shown(requests: list[Request]) -> list[str]:
     """The first prompt of the step in full, then the end of the others: one for each purpose."""
-    step = [r for r in requests if r.tag.step == STEP]
+    step = sorted((r for r in requests if r.tag.step == STEP), key=lambda r: r.tag.module.partition(".")[0] == "memory")
     if not step:
         return ["(no request at this step)"]
     parts = [f"`{step[0].tag.path}`{_sampling(step[0])}", _fenced("\n\n".join(map(_turn, step[0].messages)))]
