@@ -88,7 +88,7 @@ def _evaluated(results: Path) -> Iterator[tuple[Named, list[Row], list[Trajector
         raise SpecError(f"{results} names no trajectories; evaluate with --trajectories (`trajectories: true`)")
     names = dict.fromkeys((r["tasks"], r["policy"], r.get("run", ""), r["scaffold"]) for r in kept)
     for tasks, policy, run, scaffold in names:
-        rows = [
+        rows: list[Row] = [
             r
             for r in kept
             if (r["tasks"], r["policy"], r.get("run", ""), r["scaffold"]) == (tasks, policy, run, scaffold)
