@@ -294,7 +294,7 @@ def methods(names: Sequence[str] = ()) -> dict[str, Mapping[str, Mapping[str, An
     """Method -> its presets; all that are registered."""
     found: dict[str, Mapping[str, Mapping[str, Any]]] = {}
     for name, entry in REGISTRY.all("memory").items():
-        if (not names and name not in NOT_MEMORIES) or name in names:
+        if (not names and name not in NOT_MEMORIES and not entry.declaration.extra) or name in names:
             found[name] = {preset: {"preset": preset} for preset in entry.presets} or {"": {}}
     for name in set(names) - set(found) - set(LIBRARIES):
         entry = REGISTRY.get("memory", name)  # an alias, or an error with the nearest names

@@ -6,7 +6,6 @@ out of its row.
 
 from __future__ import annotations
 
-import os
 import random
 import statistics
 import time
@@ -96,17 +95,15 @@ def langmem(size: int, repeats: int, dim: int) -> dict[str, Any] | None:
 
 
 def mem0ai(size: int, repeats: int, dim: int) -> dict[str, Any] | None:
-    """Mem0's `add(infer=False)` and `search` over its local Qdrant, telemetry off."""
-    os.environ["MEM0_TELEMETRY"] = "False"
+    """Mem0's `add(infer=False)` and `search` over its local Qdrant in memory, telemetry off."""
     try:
-        from agentspec.memory.mem0ai import local_memory
+        from agentspec.memory.libraries.mem0_store import local_memory
     except ImportError:
         return None
     embedder = CachedEmbedder(HashEmbedder(dim), 10 * (size + repeats))
-    memory = local_memory(embedder)
-    if memory is None:
-        return None
+    memory = local_memory(lambda text: embedder.embed([text])[0].tolist(), dim)
     entries, queries, more = sentences(size, repeats)
+    embedder.embed([*entries, *queries, *more])
     for text in entries:
         memory.add(text, user_id="agent", infer=False)
     retrieved = [timed(lambda q=q: memory.search(q, user_id="agent", limit=K)) for q in queries]  # type: ignore[misc]

@@ -17,7 +17,7 @@ from trl import GRPOConfig
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import SpecError
+from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import field_rules
@@ -141,6 +141,14 @@ def check_calls(config: ScaffoldConfig) -> None:
             f"mask_truncated {nowhere} match no call of this scaffold, so nothing would be masked by them; its calls "
             f"come from {', '.join(sorted(set(paths)))}"
         )
+    for kind in MODULE_KINDS:
+        name = getattr(spec, kind).name
+        why = REGISTRY.get(kind, name).declaration.untrainable
+        if why:
+            raise SpecError(
+                f"agent.{kind} {name!r} cannot be trained through: {why}; train inside a method of AgentSpec's own, "
+                "and evaluate with this one"
+            )
     if "images" in spec.needs():
         raise SpecError(
             "agent.perception has images: true, and the policy that is trained reads text only (pictures have no token "
