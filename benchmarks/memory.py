@@ -18,7 +18,8 @@ itself. Per method and size, in milliseconds:
 A method that raises has its error in place of figures, and the exit code is 1.
 
 Beside them, where they are installed, libraries with the same sentences and vectors: `chromadb` (an ephemeral
-collection), `langmem` (its in-memory store) and `mem0ai` (its vector store without the model).
+collection), `langmem_store` (the store of LangGraph that LangMem writes into) and `mem0ai` (its local Qdrant, without
+the model); and `vector_index`, what this package's memories store in, without the bounds that a method sets.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Memory libraries on the sentences and vectors of `benchmarks.memory`, where they are installed.
+"""Memory libraries on the sentences and vectors of `benchmarks.memory`, where they are installed, beside our own index.
 
-Each is measured as what a memory stores in: no language model is asked. What a library cannot do (a snapshot) is left
-out of its row.
+Each is measured as what a memory stores in: no language model is asked, and vectors are ready. What a library cannot do
+(a snapshot) is left out of its row.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from agentspec.embedding import CachedEmbedder, HashEmbedder
+from agentspec.retrieval import VectorIndex
 from benchmarks.retrieval import sentence
 
 K = 10
@@ -41,6 +42,19 @@ def row(retrieved: list[float], stored: list[float], size: int) -> dict[str, Any
         found[f"{name}_p50_ms"] = statistics.median(ordered)
         found[f"{name}_p99_ms"] = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
     return found
+
+
+def vector_index(size: int, repeats: int, dim: int) -> dict[str, Any]:
+    """What this package's memories store in: exact search over one matrix."""
+    entries, queries, more = sentences(size, repeats)
+    embedder = CachedEmbedder(HashEmbedder(dim), 10 * (size + repeats))
+    embedder.embed([*entries, *queries, *more])
+    index = VectorIndex(embedder)
+    for i, text in enumerate(entries):
+        index.put(i, text)
+    retrieved = [timed(lambda q=q: index.search(q, K)) for q in queries]  # type: ignore[misc]
+    stored = [timed(lambda i=i, t=t: index.put(size + i, t)) for i, t in enumerate(more)]  # type: ignore[misc]
+    return row(retrieved, stored, size)
 
 
 def chromadb(size: int, repeats: int, dim: int) -> dict[str, Any] | None:
@@ -111,7 +125,12 @@ def mem0ai(size: int, repeats: int, dim: int) -> dict[str, Any] | None:
     return row(retrieved, stored, size)
 
 
-LIBRARIES: dict[str, Measured] = {"chromadb": chromadb, "langmem_store": langmem, "mem0ai": mem0ai}
+LIBRARIES: dict[str, Measured] = {
+    "vector_index": vector_index,
+    "chromadb": chromadb,
+    "langmem_store": langmem,
+    "mem0ai": mem0ai,
+}
 """Name in the table -> (entries, repeats, dimensions) -> figures, or `None` where it is not installed."""
 
 __all__ = ["LIBRARIES"]

@@ -61,7 +61,6 @@ class GraphitiLibrary(LibraryMemory):
         extra="graphiti",
         untrainable="its prompts hold the time of day and its ids are random, so an episode cannot be played again",
         name=name,
-        aliases=("graphiti",),
     )
 
     def __init__(
