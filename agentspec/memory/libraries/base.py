@@ -192,7 +192,7 @@ class LibraryMemory(ABC):
 
     def snapshot(self) -> bytes:
         """What the library holds, as texts; vectors are made anew when it is restored."""
-        waiting = [step.state() for step in self._pending]
+        waiting = [step.row() for step in self._pending]
         return dump_state([self.export(), waiting, list(self._lines), self._failures, self._last_error])
 
     def restore(self, blob: bytes) -> None:
