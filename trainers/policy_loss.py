@@ -59,7 +59,7 @@ class PolicyLoss(Base):
             model = self.accelerator.unwrap_model(self.model)
             initial = self.args.reference == "initial" and "ref" in model.peft_config  # TRL's copy of the adapter
             with use_adapter(model, adapter_name="ref" if initial else None):
-                return rows_logprobs(model, rows, **self._packing)[0]
+                return rows_logprobs(model, rows, frozen=self._below, **self._packing)[0]
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
         self._current = inputs
@@ -106,7 +106,9 @@ class PolicyLoss(Base):
         inputs = self._current
         assert inputs is not None, "log-probabilities are computed inside a loss"
         with self.accelerator.autocast():
-            logps, entropies = rows_logprobs(model, inputs[ROWS], skip_backward=self._skip_backward, **self._packing)
+            logps, entropies = rows_logprobs(
+                model, inputs[ROWS], skip_backward=self._skip_backward, frozen=self._below, **self._packing
+            )
         trained, current = inputs["tool_mask"], logps.detach()
         if self._step % self._steps_per_round < self.args.gradient_accumulation_steps:  # still those that sampled
             self._sampling_metrics.differences.append((current - inputs["sampled_logprobs"]).abs()[trained > 0])

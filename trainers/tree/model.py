@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from agentspec.registry import SpecError
+from trainers.frozen import replaced
 from trainers.logprobs import sampled_logprobs
 from trainers.tree.attention import register
 from trainers.tree.trie import Tree, build_tree
@@ -67,15 +69,39 @@ def enable_tree(model: nn.Module) -> None:
             return original(*args, **kwargs)
         for name in ("attention_mask", "labels", "inputs_embeds", "use_cache"):
             kwargs.pop(name, None)  # wrappers (PEFT) pass these along as None
-        # A four-dimensional mask is passed on untouched: no (N, N) mask is built, and ours does not read it.
-        nothing = torch.empty(1, 1, 1, 1, device=wanted.before.device)
-        hidden = self.base_model(*args, attention_mask=nothing, use_cache=False, tree=tree, **kwargs)
+        kwargs |= decoder_inputs(tree, wanted.before.device)
+        with last_layer_at(self.base_model, wanted.before):
+            hidden = self.base_model(*args, use_cache=False, **kwargs)
         output: TreeOutput = self.get_output_embeddings()(hidden.last_hidden_state[0][wanted.before], wanted=wanted)
         return output
 
     base.forward = types.MethodType(forward, base)
     base._agentspec_tree = True
     _check(model, base)
+
+
+@contextmanager
+def last_layer_at(decoder: Any, places: torch.Tensor) -> Iterator[None]:
+    """Inside, the last layer computes queries and everything after attention at `places` of the packed row only.
+
+    Nothing is read elsewhere, where zeros stand. Where the layer is recomputed backward, all of it is computed.
+    """
+    last = (getattr(decoder, "layers", None) or [None])[-1]
+    if last is None or getattr(last, "gradient_checkpointing", False):
+        yield
+        return
+    index = places.unique()
+    attention, mlp = getattr(last, "self_attn", None), getattr(last, "mlp", None)
+    modules = [getattr(attention, "q_proj", None), getattr(attention, "o_proj", None)]
+    modules += [mlp] if hasattr(mlp, "down_proj") else []  # of a mixture of experts, all is computed
+    with replaced({m: functools.partial(_at, m.forward, index) for m in modules if m is not None}):
+        yield
+
+
+def _at(forward: Callable[..., torch.Tensor], index: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """`forward` of x (1, N, in) at the places of `index`, zeros elsewhere: (1, N, out)."""
+    out = forward(x.index_select(1, index))
+    return out.new_zeros(1, x.shape[1], out.shape[-1]).index_copy(1, index, out)
 
 
 def _enable_head(model: Any) -> None:
@@ -148,6 +174,11 @@ def packed_inputs(tree: Tree, device: torch.device) -> dict[str, Any]:
         "input_ids": torch.tensor([tree.tokens], device=device),
         "position_ids": torch.tensor([tree.positions], device=device),
     }
+
+
+def decoder_inputs(tree: Tree, device: torch.device) -> dict[str, Any]:
+    """What a decoder is given beside them: a four-dimensional mask is passed on untouched, and ours is not read."""
+    return {"attention_mask": torch.empty(1, 1, 1, 1, device=device), "tree": tree}
 
 
 def wanted_tokens(
