@@ -103,7 +103,7 @@ class Database:
         self._db = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
         self._db.executescript(TABLES)
         self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
-        self._words = Lexical()
+        self._words: Lexical | None = None  # made when it is first asked
         self._rows: dict[int, Json] = {}  # the rows of `steps`, which nobody changes, as a snapshot has them
 
     def add(self, row: Sequence[Any]) -> None:
@@ -111,21 +111,27 @@ class Database:
         values = tuple(row)
         cursor = self._db.execute(f"INSERT INTO steps VALUES ({','.join('?' * COLUMNS)})", values)
         id = int(cursor.lastrowid or 0)
-        self._words.put(id, " ".join(v for v in values[3:] if isinstance(v, str)))
+        if self._words is not None:
+            self._words.put(id, _words_of(values))
         self._rows[id] = Json.of([id, *values[1:]])
 
     def trim(self, steps: int, notes: int) -> int:
         """Keep the newest rows of each table; how many went."""
-        newest = "id NOT IN (SELECT id FROM steps ORDER BY id DESC LIMIT ?)"
-        for (old,) in self.rows(f"SELECT id FROM steps WHERE {newest}", (steps,)):  # a constant
-            self._words.remove(old)
-            del self._rows[old]
-        gone = self._db.execute(f"DELETE FROM steps WHERE {newest}", (steps,)).rowcount
-        newest = newest.replace("steps", "notes")
-        return gone + self._db.execute(f"DELETE FROM notes WHERE {newest}", (notes,)).rowcount
+        old = list(self._rows)[: max(0, len(self._rows) - steps)] if len(self._rows) > steps else []
+        for id in old:
+            if self._words is not None:
+                self._words.remove(id)
+            del self._rows[id]
+        self._db.executemany("DELETE FROM steps WHERE id = ?", [(id,) for id in old])
+        newest = "SELECT id FROM notes ORDER BY id DESC LIMIT ?"
+        return len(old) + self._db.execute(f"DELETE FROM notes WHERE id NOT IN ({newest})", (notes,)).rowcount
 
     def like(self, text: str, most: int) -> list[int]:
         """Ids of the steps that share words with a text, by BM25, best first."""
+        if self._words is None:
+            self._words = Lexical()
+            for row in self.rows("SELECT * FROM steps ORDER BY id"):
+                self._words.put(row[0], _words_of(row))
         return [key for key, _ in self._words.search(text, most)]
 
     def rows(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
@@ -163,12 +169,17 @@ class Database:
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""
-        self._words, self._rows = Lexical(), {}
+        self._words, self._rows = None, {}
         self._db.execute("DELETE FROM steps")
         self._db.execute("DELETE FROM notes")
         for row in state[0]:
             self.add(row)
         self._db.executemany("INSERT INTO notes VALUES (?, ?)", state[1])
+
+
+def _words_of(row: Sequence[Any]) -> str:
+    """The words that a step is found by: place, state, action, arguments, feedback."""
+    return " ".join(value for value in row[3:] if isinstance(value, str))
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Which lines of a module's functions run: a line tracer for one file, without a dependency."""
+"""Which lines of a method's functions run: a line tracer for its files, without a dependency."""
 
 from __future__ import annotations
 
@@ -33,18 +33,28 @@ def function_lines(path: Path) -> set[int]:
     return lines
 
 
-@contextmanager
-def traced(path: Path) -> Iterator[set[int]]:
-    """The lines of the file that run inside; in this thread only."""
-    name, seen = str(path), set[int]()
+def files_of(path: Path) -> list[Path]:
+    """The files of the method whose class is in `path`: all of its folder where it has one, else that one."""
+    return sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]
 
-    def local(frame: FrameType, event: str, argument: Any) -> Any:
-        if event == "line":
-            seen.add(frame.f_lineno)
-        return local
+
+@contextmanager
+def traced(*paths: Path) -> Iterator[dict[Path, set[int]]]:
+    """The lines of the files that run inside; in this thread only."""
+    seen: dict[Path, set[int]] = {path: set() for path in paths}
+    by_name = {str(path): lines for path, lines in seen.items()}
 
     def tracer(frame: FrameType, event: str, argument: Any) -> Any:
-        return local if frame.f_code.co_filename == name else None
+        lines = by_name.get(frame.f_code.co_filename)
+        if lines is None:
+            return None
+
+        def local(frame: FrameType, event: str, argument: Any) -> Any:
+            if event == "line":
+                lines.add(frame.f_lineno)
+            return local
+
+        return local
 
     before = sys.gettrace()
     sys.settrace(tracer)

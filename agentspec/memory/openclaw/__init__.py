@@ -78,7 +78,8 @@ class OpenClaw:
     Args:
         preset: `paper` (edits after every 2 steps, 6 log entries searched) or `rl` (every 8 steps, 3 entries).
         every: steps between edits.
-        search: log entries that search shows in a step.
+        search: log entries that search shows in a step, at most a third of those that it chooses from.
+        least: smallest score of a log entry that search shows (upstream's `minScore`).
         recent: newest steps that are always shown where no conversation shows them.
         skills: folder with skills of your own (`NAME/SKILL.md`); one that is learnt replaces one of the same name.
         skills_shown: skills whose body is shown in a step.
@@ -130,6 +131,7 @@ class OpenClaw:
         preset: str = "paper",
         every: int | None = None,
         search: int | None = None,
+        least: float = 0.35,
         recent: int = 3,
         skills: str = "",
         skills_shown: int = 1,
@@ -166,7 +168,7 @@ class OpenClaw:
                 "and soft below 1 together"
             )
         self.services = services
-        self.recent, self.skills_shown, self.skill_least = recent, skills_shown, skill_least
+        self.least, self.recent, self.skills_shown, self.skill_least = least, recent, skills_shown, skill_least
         self.diverse, self.half_life = diverse, half_life
         self.memory_tokens, self.skill_tokens = memory_tokens, skill_tokens
         self.max_skills, self.max_log = max_skills, max_log
@@ -340,14 +342,19 @@ class OpenClaw:
                 self._vectors.remove(oldest)
 
     def _searched(self, query: str, k: int) -> list[tuple[int, float]]:
-        """Log entries that fit, and that the prompt does not show anyway, oldest first."""
+        """Log entries that fit, and that the prompt does not show anyway, oldest first.
+
+        At most a third of them: a search that gives nearly all there is has chosen nothing.
+        """
         now = self.services.time()
         snapshot = self.services.context.layout == "snapshot"
         first = max(0, now.step - self.recent) if snapshot else self._held_from
         notes = self._notes()
         hidden = max(0, now.step - first) + len(notes)
-        hits = hybrid(self._vectors, self._words, query, k + hidden, diverse=self.diverse) if k else []
+        k = min(k, (len(self.log) - hidden + 2) // 3)
+        hits = hybrid(self._vectors, self._words, query, k + hidden, diverse=self.diverse) if k > 0 else []
         hits = [(key, s * decay(now.episode - self.log[key].episode, self.half_life)) for key, s in hits]
+        hits = [hit for hit in hits if hit[1] >= self.least]
 
         def is_shown(chunk: Chunk) -> bool:
             here = chunk.episode == now.episode and chunk.step >= first and not chunk.note
