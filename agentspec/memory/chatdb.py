@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import FEEDBACK_TOKENS, first_held, step_name
+from agentspec.memory.parts.steps import FEEDBACK_TOKENS, IN, brief, first_held, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical
@@ -278,7 +278,8 @@ class ChatDB:
             now = self.services.time()
             newest = "WHERE episode = ? AND step >= ? ORDER BY id"
             rows = self._lines(newest, (now.episode, max(0, now.step - self.recent)))
-            items += [RecallItem(line, priority=3.0 + i) for i, (_, line) in enumerate(rows)]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(line, count), priority=3.0 + i) for i, (_, line) in enumerate(rows)]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:
@@ -353,15 +354,16 @@ class ChatDB:
         first = max(0, now.step - self.recent) if snapshot else self._held_from
         hidden = max(0, now.step - first)
         alike = self.db.like(input.text, 3 * limit + hidden)
-        # Of steps that failed alike the newest stands for all.
-        failures = "id IN (SELECT max(id) FROM steps WHERE ok = 0 GROUP BY action, args, feedback)"
+        # Of steps that went alike the newest stands for all.
+        newest = "id IN (SELECT max(id) FROM steps WHERE {} GROUP BY action, args, feedback)"
+        failures = newest.format("ok = 0")
         alike_ids = f"(ok = 1 OR {failures}) AND id IN ({','.join(map(str, alike)) or 'NULL'})"
         shown: set[int] = set()
         found: list[tuple[str, str]] = []
         for about, where, order, values in (
             ("Failed before", failures, "id DESC", ()),
-            ("Best rewards", "reward > 0", "reward DESC, id DESC", ()),
-            ("Worst rewards", "reward < 0", "reward, id DESC", ()),
+            ("Best rewards", newest.format("reward > 0"), "reward DESC, id DESC", ()),
+            ("Worst rewards", newest.format("reward < 0"), "reward, id DESC", ()),
             ("At this place before", "place <> '' AND place = ?", "id DESC", (place_of(input.state),)),
             ("Like now", alike_ids, "id", ()),
         ):
@@ -384,11 +386,11 @@ class ChatDB:
     def _line(
         self, episode: int, step: int, action: str, args: str, ok: int, feedback: str, reward: float, state: str
     ) -> str:
-        seen = excerpt(state, self.state_tokens // 2, self.services.llm.count_tokens)
+        seen = excerpt(state, self.state_tokens // 4, self.services.llm.count_tokens)
         told = f"{action}({args})" if action.isidentifier() else action
         paid = f" ({reward:+.2f})" if reward else ""
         name = step_name(episode, step, self.services.time())
-        return f"{name}: {told} {'->' if ok else 'failed:'} {feedback}{paid} | in: {seen}"
+        return f"{name}: {told} {'->' if ok else 'failed:'} {feedback}{paid}{IN}{seen}"
 
     def describe(self) -> str:
         """All rows as text."""

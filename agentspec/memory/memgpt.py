@@ -18,12 +18,13 @@ Cost per step: none to retrieve; at most 2 calls per `every` steps (1 to 2 after
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, distinct, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -194,7 +195,8 @@ class MemGPT:
         if self.services.context.layout == "snapshot":
             if self.summary:
                 items.append(RecallItem(CARRY.format(summary=self.summary), kind="summary", priority=3.0))
-            items += [RecallItem(self._named(m), priority=5.0 + m.step) for m in self._queue()]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(m), count), priority=5.0 + m.step) for m in self._queue()]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:
@@ -235,7 +237,8 @@ class MemGPT:
     def _prompt(self, since: int, warning: str, results: list[str]) -> str:
         count = self.services.llm.count_tokens
         here = self.services.time().episode
-        steps = [self._named(m) for m in self.recall.values() if m.episode == here and m.step >= since]
+        ours = itertools.takewhile(lambda m: m.episode == here and m.step >= since, reversed(self.recall.values()))
+        steps = [self._named(m) for m in ours][::-1]
         told = "\n\nResults of your calls:\n" + "\n".join(results) if results else ""
         return EDIT.format(
             chars=self.block_chars,
@@ -313,7 +316,8 @@ class MemGPT:
 
     def _recall_search(self, call: FunctionCall) -> str:
         page = max(0, call.page)
-        hits = self._words.search(call.query, PAGE * (page + 1))
+        hits = self._words.search(call.query, 2 * PAGE * (page + 1))
+        hits = distinct(hits, lambda key: self.recall[key].text)
         return self._page([self._named(self.recall[key]) for key, _ in hits], page)
 
     def _page(self, texts: list[str], page: int) -> str:
@@ -346,7 +350,8 @@ class MemGPT:
         return self._size(self._queue())
 
     def _size(self, queue: list[Message]) -> int:
-        return sum(self.services.llm.count_tokens(self._named(m)) + 1 for m in queue)
+        count = self.services.llm.count_tokens
+        return sum(count(brief(self._named(m), count)) + 1 for m in queue)
 
     async def _evict(self) -> None:
         """Let the oldest messages leave the queue, down to 0.75 of it; a summary of them and the one before stays."""

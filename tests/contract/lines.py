@@ -17,13 +17,15 @@ def _codes(code: CodeType) -> list[CodeType]:
     return [c for c in code.co_consts if isinstance(c, CodeType)]
 
 
-def function_lines(path: Path) -> set[int]:
+def function_lines(path: Path, *, public: bool = False) -> set[int]:
     """The lines of a file's functions that can run; `def` lines and docstrings are none.
 
-    Public functions beside the classes serve other modules and have tests of their own: they do not count.
+    Args:
+        public: whether public functions beside the classes count: in a helper of the method's own folder; elsewhere
+            they serve other modules and have tests of their own.
     """
     module = compile(path.read_text(encoding="utf-8"), str(path), "exec")
-    stack = [c for c in _codes(module) if not c.co_flags & NEW_LOCALS or c.co_name.startswith(("_", "<"))]
+    stack = [c for c in _codes(module) if public or not c.co_flags & NEW_LOCALS or c.co_name.startswith(("_", "<"))]
     lines: set[int] = set()
     while stack:
         code = stack.pop()

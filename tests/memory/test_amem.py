@@ -102,7 +102,7 @@ def test_links_are_followed_one_way_and_at_most_as_many_as_were_asked_for() -> N
     memory = AMem(services(Asked(analyse=PLAIN, evolve=STAY)))
     learn(memory, "red key", "far hill", "old mill", "green boat")
     notes = memory.notes
-    notes[0].links = [1, 2, 9]  # 9 is gone
+    memory._change(notes[0], links=[1, 2, 9])  # 9 is gone
     assert recalled(memory, "red key", 1) == ["n0", "n1"]
     assert recalled(memory, "far hill", 1) == ["n1"]
     assert "over" not in memory._shown(notes[0])

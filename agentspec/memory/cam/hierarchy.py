@@ -44,6 +44,7 @@ class Level:
             for node in affected
             if node in self.replicas
         }
+        touched = {label for parts in before.values() for _, label in parts}
         anew = ego_split(self.graph, affected)
         self.replicas = {node: anew.get(node) or self.replicas[node] for node in self.graph}
         labels: dict[tuple[int, int], int] = {}
@@ -56,13 +57,19 @@ class Level:
         changed = [(node, i) for node in affected for i in range(len(self.replicas[node]))]
         split = replica_graph(self.graph, self.replicas)
         self.labels = label_propagation(split, start=labels, changed=changed)
-        self._part(split)
+        touched |= {label for replica, label in labels.items() if self.labels[replica] != label}
+        self._part(split, touched | {self.labels[replica] for replica in changed})
 
-    def _part(self, split: Graph[tuple[int, int]]) -> None:
-        """A fresh label for each part of a cluster that is not connected with its largest one (of equals the first)."""
+    def _part(self, split: Graph[tuple[int, int]], touched: set[int]) -> None:
+        """A fresh label for each part of a cluster that is not connected with its largest one (of equals the first).
+
+        Args:
+            touched: labels that have lost or got replicas, or whose replicas have got other neighbours.
+        """
         members: dict[int, list[tuple[int, int]]] = {}
         for replica, label in self.labels.items():
-            members.setdefault(label, []).append(replica)
+            if label in touched:
+                members.setdefault(label, []).append(replica)
         for replicas in members.values():
             parts = split.components(replicas) if len(replicas) > 1 else []
             for part in sorted(parts, key=lambda p: -len(p))[1:]:

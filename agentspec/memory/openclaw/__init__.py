@@ -25,7 +25,16 @@ from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.openclaw.files import FileTree, Skill, one_line, rule_name, rules_of, rules_text, skills_in, slug
 from agentspec.memory.openclaw.prompts import DREAM, FLUSH, HEAD, LEARN, NOTHING
 from agentspec.memory.openclaw.search import Chunk, decay, dream_score, hybrid, kept_share
-from agentspec.memory.parts.steps import first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    brief,
+    distinct,
+    first_held,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -205,7 +214,8 @@ class OpenClaw:
             items.append(RecallItem(self._named(chunk), score, source=self._log_path(chunk.episode), priority=score))
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
-            items += [RecallItem(self._named(c), 1.0, priority=5.0 + c.step) for c in newest]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(c), count), 1.0, priority=5.0 + c.step) for c in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -360,7 +370,8 @@ class OpenClaw:
             here = chunk.episode == now.episode and chunk.step >= first and not chunk.note
             return here or any(chunk is note for note in notes)
 
-        return sorted(sorted((h for h in hits if not is_shown(self.log[h[0]])), key=lambda h: -h[1])[:k])
+        fresh = sorted((h for h in hits if not is_shown(self.log[h[0]])), key=lambda h: -h[1])
+        return sorted(distinct(fresh, lambda key: self.log[key].text)[:k])
 
     def _skill_items(self, query: str) -> list[RecallItem]:
         skills = list(self._all_skills().values())

@@ -126,6 +126,8 @@ ALIKE = 0.6
 """From here on names may mean the same thing."""
 SHOWN_NAMES = 20
 COMMUNITY_FACTS = 12
+MOST_EPISODES = 200
+"""Episodes of a run whose beginnings are known; facts of earlier ones count as of the earliest of these."""
 
 
 @dataclass(frozen=True)
@@ -246,10 +248,13 @@ class ZepMemory:
         self._pending: list[Step] = []
         self._lines: list[str] = []
         self._waited = 0
+        self._begins: list[list[int]] = []  # episodes: the step of the run each began with, and its number
         self._ended = False  # whether an episode has ended since communities were looked for
 
     def begin_episode(self, task: Task) -> None:
+        now = self.services.time()
         self._ended = bool(self._pending or len(self.graph.facts))
+        self._begins = [*self._begins, [now.total - now.step, now.episode]][-MOST_EPISODES:]
         self._lines, self._waited = [], 0
 
     # -- recall ----------------------------------------------------------------------------------------------------
@@ -273,19 +278,18 @@ class ZepMemory:
 
     def shown(self, fact: Entry) -> str:
         """A fact with its times."""
-        begin = stamp(self._time(fact.data["valid"], fact.time), self.services.time())
+        begin = stamp(self._time(fact.data["valid"]), self.services.time())
         if fact.data["invalid"] is None:
             return f"- {fact.text} [since {begin}]"
-        end = stamp(self._time(fact.data["invalid"], fact.time), self.services.time())
+        end = stamp(self._time(fact.data["invalid"]), self.services.time())
         return f"- Not so any more: {fact.text} [from {begin} to {end}]"
 
-    def _time(self, total: int, known: Time) -> Time:
-        """A step of the run by episode and number: of the present episode, or counted from a time of its own."""
+    def _time(self, total: int) -> Time:
+        """A step of the run by episode and number."""
         now = self.services.time()
-        began = now.total - now.step
-        if total >= began:
-            return Time(now.episode, total - began, total)
-        return Time(known.episode, max(0, known.step + total - known.total), total)
+        known = [*self._begins, [now.total - now.step, now.episode]]
+        began, episode = next((b for b in reversed(known) if b[0] <= total), known[0])
+        return Time(episode, max(0, total - began), total)
 
     def _summary_for(self, text: str) -> str:
         votes: dict[int, int] = {}
@@ -468,12 +472,12 @@ class ZepMemory:
     def snapshot(self) -> bytes:
         summaries = [[label, ids, text] for label, (ids, text) in self.summaries.items()]
         pending = joined(s.json for s in self._pending)
-        flags = [self._waited, self._ended]
+        flags = [self._waited, self._ended, self._begins]
         return dump_state([self.graph.state(), list(self.labels.items()), summaries, pending, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         graph, labels, summaries, pending, self._lines, flags = load_state(blob)
-        self._waited, self._ended = flags
+        self._waited, self._ended, self._begins = flags
         self.graph.load(graph)
         self.labels = {id: label for id, label in labels}
         self.summaries = {label: (ids, text) for label, ids, text in summaries}

@@ -40,6 +40,7 @@ class TemporalGraph:
         self._of: dict[int, dict[int, None]] = {}  # entity -> its facts
         self._called: dict[int, list[str]] = {}  # entity -> its normal names
         self._numbered: dict[tuple[str, ...], dict[int, None]] = {}  # numbers in a name -> entities
+        self._written: dict[int, Json] = {}  # entities as a snapshot has them, until they change
 
     # -- entities --------------------------------------------------------------------------------------------------
 
@@ -60,6 +61,7 @@ class TemporalGraph:
         if normal(name) not in self._ids:
             self._ids[normal(name)] = id
             self._called[id].append(normal(name))
+            self._written.pop(id, None)
 
     def alike(self, name: str, k: int, least: float) -> list[int]:
         """Known entities that `name` may mean: near in meaning or sharing words, and with the same numbers in it.
@@ -188,6 +190,7 @@ class TemporalGraph:
         subject, target = self._ends(fact)
         for entity in (subject, target):
             self._of[entity][fact.id] = None
+            self._written.pop(entity, None)
         self.graph.connect(subject, target)
 
     def _unlink(self, fact: Entry) -> None:
@@ -195,6 +198,7 @@ class TemporalGraph:
         subject, target = self._ends(fact)
         for entity in dict.fromkeys((subject, target)):
             self._of[entity].pop(fact.id, None)
+            self._written.pop(entity, None)
         if not self._of[subject].keys() & self._of[target].keys():
             self.graph.disconnect(subject, target)
         for entity in dict.fromkeys((subject, target)):
@@ -212,13 +216,15 @@ class TemporalGraph:
 
     def state(self) -> Json:
         """State as JSON."""
-        entities = [[id, name, self._called[id], list(self.graph.neighbours(id))] for id, name in self.names.items()]
-        return joined([entities, self.facts.state()])
+        for id, name in self.names.items():
+            if id not in self._written:
+                self._written[id] = Json.of([id, name, self._called[id], list(self.graph.neighbours(id))])
+        return joined([joined(self._written[id] for id in self.names), self.facts.state()])
 
     def load(self, state: list[Any]) -> None:
         """Return to `state`."""
         entities, facts = state
-        self.names, self._ids, self._of, self._called, self._numbered = {}, {}, {}, {}, {}
+        self.names, self._ids, self._of, self._called, self._numbered, self._written = {}, {}, {}, {}, {}, {}
         self.graph = Graph()
         self.facts.load(facts)
         for id, name, called, _ in entities:
