@@ -4,16 +4,18 @@
 
 Every registered memory is filled with the steps of a courier's days (an episode ends every 40 steps), its questions
 answered by a script: the examples that it declares, with sentences of such a day in place of theirs, so that what is
-kept differs from entry to entry. Time spent in the model and in the embedder is not counted: what is left is the method
-itself. Per method and size, in milliseconds:
+kept differs from entry to entry. Time is the processor's, and what is spent in the model and in the embedder is not
+counted: what is left is the method itself, whatever else the machine does. Per method and size, in milliseconds:
 
 - `retrieve_p50_ms`, `retrieve_p99_ms`, `store_p50_ms`, `store_p99_ms`: one call, of 50.
 - `episode_p50_ms`: what an episode's end and the beginning of the next take.
-- `snapshot_ms`, `restore_ms`: median of 5; restored into a fresh instance, and used once (indexes may be built then).
+- `snapshot_ms`: median of 5, each after one more step. `first_snapshot_ms`: the first one of an instance that has just
+  been restored (what an episode that starts from a carried memory pays at its end; nothing is written yet).
+- `restore_ms`: restored into a fresh instance, and used once (indexes may be built then).
 - `bytes_per_entry`: snapshot per stored step; `growth`: how the snapshot grew since the size before, as a share of how
   the number of steps did (1: in proportion, 0: not at all, as of a memory with a cap or a sheet of fixed length).
-- `entries`: what the method says that it holds, where it does; `filled`: steps stored, fewer than the size where
-  filling took longer than `--seconds`.
+- `entries`: what the method says that it holds, where it does; `filled`: steps stored; `not_reached`: why these are
+  fewer than the size (a cell is filled for at most `--seconds`, and the larger sizes of the method are left out).
 
 A method that raises has its error in place of figures, and the exit code is 1.
 
@@ -277,6 +279,8 @@ async def measured(filled: Filled, size: int, seconds: float) -> dict[str, Any]:
         "filled": steps,
         "stored": filled.steps,
     }
+    if steps < size:
+        figures["not_reached"] = f"{seconds:g} s of storing gave {steps} steps"
     own = getattr(filled.agent.memory, "metrics", dict)()
     return figures | ({"entries": own["entries"]} if "entries" in own else {})
 
@@ -321,6 +325,8 @@ def measure(
         try:
             for size in sorted(sizes):
                 rows[str(size)] = asyncio.run(measured(filled, size, seconds))
+                if "not_reached" in rows[str(size)]:
+                    break
             with_growth(rows)
         except Exception as error:
             rows["error"] = {"error": f"{type(error).__name__}: {error}"}

@@ -1,8 +1,8 @@
 """Write the prompt gallery, `docs/prompts/`: `python docs/update_prompts.py`. A test holds that it is current.
 
-One page per method, and one per memory (see `memory_gallery`). Every page shows the full prompt of an action at the third step, for both layouts and for native
-and menu actions of each environment, and what else the method asks at such a step. A scripted model answers; nothing of
-it is random, so a page changes only when a prompt does.
+One page per method, and one per memory (`memory_gallery`). A method's page shows the full prompt of an action at the
+third step, for both layouts and for native and menu actions of each environment, and what else the method asks at such
+a step. A scripted model answers; nothing of it is random, so a page changes only when a prompt does.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from agentspec.tokens import estimate_tokens
 from agentspec.types import Task
 
 sys.path.insert(0, str(Path(__file__).parent))
-import memory_gallery  # noqa: E402
+import memory_gallery
 
 FOLDER = Path(__file__).with_name("prompts")
 STEP = 2

@@ -1,10 +1,10 @@
 """One level of CAM's hierarchy: a graph whose nodes may belong to several clusters, kept up to date as it grows.
 
 Every node is split into replicas, one per group of its neighbours that hang together without it (ego-splitting); labels
-spread over the graph of replicas, and replicas of one label that hang together are a cluster (where a label has come
-to stand at places with no way between them, all but the largest part get a new one). When nodes or edges change, only the nodes
-they touch are split anew, and labels spread from their replicas: a replica keeps the label of the one it comes from
-(the one of the same node with most neighbours in common), a new one gets a label that was never there.
+spread over the graph of replicas, and replicas of one label are a cluster. It hangs together: where a label has come to
+stand at places with no way between them, all but the largest part get a new one. When nodes or edges change, only the
+nodes they touch are split anew, and labels spread from their replicas: a replica keeps the label of the one it comes
+from (the one of the same node with most neighbours in common), a new one gets a label that was never there.
 """
 
 from __future__ import annotations
