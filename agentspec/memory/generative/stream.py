@@ -114,18 +114,11 @@ class Stream:
         return sum((weight * normalised(term) for weight, term in terms), start=np.zeros(n))
 
     def recall(self, query: str, k: int, now: int) -> list[tuple[Memory, float]]:
-        """The `k` best memories with their scores, best first; of equals the one written first. They count as used.
-
-        Of memories that say the same (the step of an episode, and of another of the same task) the best one stands for
-        all, as long as there are `2 * k` to choose from.
-        """
+        """The `k` best memories with their scores, best first; of equals the one written first. They count as used."""
         scores = self.scores(query, now)
-        ids = list(self._memories)
-        distinct: dict[str, int] = {}
-        for row in top_rows(scores, 2 * k):
-            distinct.setdefault(self._memories[ids[row]].text(), int(row))
-        best = list(distinct.values())[:k]
+        best = top_rows(scores, k)
         self._used[best] = now
+        ids = list(self._memories) if len(best) else []
         return [(self._memories[ids[row]], float(scores[row])) for row in best]
 
     def state(self) -> Json:
