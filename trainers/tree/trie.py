@@ -38,11 +38,6 @@ class Tree:
     places: list[list[int]] = field(default_factory=list)
     masks: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
 
-    @property
-    def packing_ratio(self) -> float:
-        """Tokens of all sequences per token computed."""
-        return sum(map(len, self.places)) / max(1, len(self.tokens))
-
     @functools.cached_property
     def lengths(self) -> list[int]:
         """Tokens per node."""

@@ -35,7 +35,7 @@ class Slot:
     multiple of ``block``.
     """
 
-    __slots__ = ("adapter", "block", "capacity", "epoch", "keys", "length", "owner", "states", "tokens", "used", "values")
+    __slots__ = tuple("adapter block capacity epoch keys length owner states tokens used values".split())
 
     def __init__(self, layers: int, capacity: int, block: int = 64) -> None:
         self.keys: list[torch.Tensor | None] = [None] * layers
