@@ -12,7 +12,7 @@ import torch
 from agentspec.tokens import shared_prefix
 from trainers.tree.flex import block_mask, subtree_ends
 
-NODE_TOKENS = 512
+NODE_TOKENS = 256
 """Longest node: a longer run of tokens becomes a chain of nodes, so that few queries see keys of their future."""
 
 
