@@ -151,7 +151,8 @@ def _use(env: AlfredEnv, native: str, text: str) -> tuple[str, str, str]:
 
 def _go(env: AlfredEnv, name: str) -> tuple[str, str, str]:
     try:
-        way = way_to_see(env.world, find(env.world, env.names.id(name)))
+        boxes = env.world.boxes()
+        way = way_to_see(boxes, find(boxes, env.names.id(name)))
     except Refused as refusal:
         way, name = None, f"{name} ({refusal})"
     if not way:

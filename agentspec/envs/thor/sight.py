@@ -46,6 +46,12 @@ SEE_THROUGH = frozenset(
 )
 """Boxes that are mostly empty: one looks under a table, between the legs of a chair, over the seat of a sofa."""
 
+AGENT_HEIGHT = 1.576
+"""Metres: where ai2thor's default agent has its camera (0.901 m and 0.675 m above it)."""
+
+ROBOT_HEIGHT = 0.87
+"""Metres: the LoCoBot's camera; not verified against the simulator."""
+
 _GRID = np.array([(x, y, z) for x in (-0.48, 0, 0.48) for y in (-0.48, 0, 0.48) for z in (-0.48, 0, 0.48)])
 
 
@@ -59,7 +65,7 @@ class Camera:
         aspect: width over height of the picture.
     """
 
-    height: float = 1.65
+    height: float = AGENT_HEIGHT
     field_of_view: float = 60.0
     aspect: float = 1.0
 
