@@ -44,7 +44,9 @@ def lines(names: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for kind, entries in names.items():
         found.append(kind)
         for name, entry in entries.items():
-            notes = "; ".join(note for note in (_calls(entry["calls"]), _needs(entry["needs"])) if note)
+            notes = "; ".join(
+                note for note in (_calls(entry["calls"]), _needs(entry["needs"], entry.get("extra", ""))) if note
+            )
             text = entry["summary"] + (f" ({notes})" if notes else "")
             found += textwrap.wrap(
                 text, WIDTH, initial_indent=f"  {name:<{wide}}  ", subsequent_indent=" " * (wide + 4)
@@ -83,5 +85,6 @@ def _calls(profile: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _needs(needs: list[str]) -> str:
-    return f"needs {', '.join(needs)}" if needs else ""
+def _needs(needs: list[str], extra: str) -> str:
+    needed = [*needs, f"extra {extra}"] if extra else needs
+    return f"needs {', '.join(needed)}" if needed else ""
