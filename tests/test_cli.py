@@ -164,6 +164,10 @@ def test_gif(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_bad_input_is_one_line_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("reasoning: direct\nmemory: {name: base\n")
+    odd, binary = tmp_path / "odd.yaml", tmp_path / "binary.yaml"
+    odd.write_text("gpt: {inputs: 1}\n")
+    binary.write_bytes(b"\xff\xfe")
+    (tmp_path / "adapter_config.json").write_text("[]")
     toy = ("run", "--env", TOY)
     for argv, parts in (
         (("run", "--env", "deliverybnch"), ("deliverybnch", "did you mean deliverybench")),
@@ -184,6 +188,9 @@ def test_bad_input_is_one_line_with_a_remedy(tmp_path: Path, capsys: pytest.Capt
         ((*toy, *SELL, "--seed", "-1"), ("--seed", "at least 0, got -1")),
         ((*toy, *SELL, "--timeout", "nan"), ("--timeout", "above 0")),
         ((*toy, *SELL, "--concurrency", "0"), ("--concurrency", "at least 1")),
+        ((*toy, *SELL, "--prices", str(odd)), ("input, output and cached",)),
+        ((*toy, *SELL, "--spec", str(binary)), ("no UTF-8 text",)),
+        ((*toy, "--policy", str(tmp_path)), ("adapter_config.json is malformed",)),
         ((*toy, "--spec", "memory: my_very_own"), ("known: ", "--import")),
         ((*toy, *SELL, "--sampling", "temperature=-1"), ("temperature >= 0",)),
         ((*toy, *SELL, "--llm", "colour=1"), ("unknown key 'colour'",)),
@@ -324,6 +331,7 @@ def test_a_memory_file_given_as_trajectories_is_recognised(tmp_path: Path, capsy
 LATE = {
     "a setting nobody takes": (["--llm", "dtyp=float32"], "did you mean dtype"),
     "a value of the wrong type": (["--llm", "max_batch=many"], "max_batch must be a whole number"),
+    "no batch": (["--llm", "max_batch=0"], "max_batch is 0; expected at least 1"),
     "a value out of its list": (["--llm", "dtype=float17"], "dtype must be 'auto' or"),
     "no embedder": (["--spec", "memory: generative"], "needs an embedder"),
     "no such adapter of a helper": (

@@ -25,7 +25,7 @@ OURS = ("agentspec", "trainers", "rewards", "eval", "recipes")
 """Packages whose `ValueError` is a check of the input; one that numpy or torch raises keeps its traceback."""
 
 EXPECTED = (SpecError, LLMError, yaml.YAMLError, FileNotFoundError, FileExistsError, NotADirectoryError)
-EXPECTED_OS = (IsADirectoryError, PermissionError)
+EXPECTED_OS = (IsADirectoryError, PermissionError, UnicodeDecodeError)
 
 EXTRAS = {
     "torch": "train",
@@ -84,6 +84,8 @@ def one_line(error: BaseException | str) -> str:
         text = (
             f"this needs the package {package}, which is not installed; pip install '{DISTRIBUTION}[{EXTRAS[package]}]'"
         )
+    elif isinstance(error, UnicodeDecodeError):
+        text = f"a file that was given is no UTF-8 text ({error}); check the path"
     elif isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror or type(error).__name__}; check the path"
     elif isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:

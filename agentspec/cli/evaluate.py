@@ -83,7 +83,9 @@ def add_parser(commands: Any) -> None:
     )
     group = parser.add_argument_group("where it runs")
     group.add_argument("--executor", choices=("local", "ray"), help="this process (default), or workers through Ray")
-    group.add_argument("--workers", type=int, metavar="N", help="Ray: processes with one model each (default: 1)")
+    group.add_argument(
+        "--workers", type=at_least(1), metavar="N", help="Ray: processes with one model each (default: 1)"
+    )
     group.add_argument("--address", metavar="URL", help="Ray: address of a cluster (default: this machine)")
     group.add_argument("--dry-run", action="store_true", help="print what would be played, and play nothing")
     group = parser.add_argument_group("output")

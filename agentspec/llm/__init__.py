@@ -14,6 +14,7 @@ from typing import Any
 from agentspec.actions import suggest
 from agentspec.llm.base import LLM, LLMError
 from agentspec.parameters import check_types
+from agentspec.registry import SpecError
 
 _TORCH = ("torch", "transformers")
 _BACKENDS: dict[str, tuple[str, str, str, tuple[str, ...], str]] = {
@@ -94,6 +95,10 @@ def _prepared(config: Mapping[str, Any]) -> tuple[Callable[..., Any], Any, dict[
         raise ValueError(f"the llm backend {backend!r} needs `{main_key}`; got {sorted(arguments) or 'nothing'}")
     for maker in makers:
         check_types(f"llm backend {backend!r}", maker, {k: v for k, v in arguments.items() if k != main_key})
+    for key, value in arguments.items():
+        lowest = 0 if key == "max_retries" else 1 if key.startswith("max_") and not key.endswith("_key") else None
+        if lowest is not None and isinstance(value, int) and value < lowest:
+            raise SpecError(f"llm backend {backend!r}: {key} is {value}; expected at least {lowest}")
     return make, arguments.pop(main_key), arguments
 
 

@@ -138,7 +138,17 @@ def base_of(name: str) -> str:
     config = Path(name).expanduser() / "adapter_config.json"
     if not config.is_file() or (config.parent / "config.json").is_file():
         return name
-    return str(json.loads(config.read_text(encoding="utf-8")).get("base_model_name_or_path") or name)
+    return str(_adapter_config(config).get("base_model_name_or_path") or name)
+
+
+def _adapter_config(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        data = None
+    if not isinstance(data, dict):
+        raise ModelNotFoundError(f"{path} is malformed; give a folder written by `PeftModel.save_pretrained`")
+    return data
 
 
 def resolve_adapter(name: str | os.PathLike[str]) -> str:
@@ -150,6 +160,7 @@ def resolve_adapter(name: str | os.PathLike[str]) -> str:
     name = os.fspath(name)
     folder = Path(name).expanduser()
     if (folder / "adapter_config.json").is_file():
+        _adapter_config(folder / "adapter_config.json")
         return str(folder)
     shipped = _shipped_adapters()
     if name in shipped:
