@@ -38,7 +38,8 @@ class Prices:
             raise ValueError(f"{path}: expected a mapping of model name to {{input, output, cached}} in $ per million")
         for name, value in data.items():
             unknown = [key for key in value if key not in Price.__dataclass_fields__]
-            if unknown or not all(isinstance(v, int | float) and v >= 0 for v in value.values()):
+            given = [v for key, v in value.items() if (key, v) != ("cached", None)]
+            if unknown or not all(isinstance(v, int | float) and v >= 0 for v in given):
                 raise ValueError(
                     f"{path}: {name} is {value}; expected input, output and cached in $ per million tokens"
                 )
