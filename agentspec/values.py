@@ -89,8 +89,10 @@ class Values:
         """A name without brackets, its arguments perhaps on a line of their own."""
         match = WORD.match(text)
         name = known_name(match.group(), self.schema) if match else None
-        if match is None or name is None or (self.schema.choices and not match.group().isupper()):
-            return None  # beside a menu only capitals are a name: "wait" is an entry, or a word
+        if match is None or name is None:
+            return None
+        if self.schema.choices and not match.group().isupper() and "_" not in match.group():
+            return None  # beside a menu "wait" is an entry, or a word, and no name
         given = INPUT.search(text, match.end())
         if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
             value = (
