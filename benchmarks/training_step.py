@@ -297,7 +297,7 @@ def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) 
             if float(g.norm()) > 0
             for name in grads
         ),
-        "packing_ratio": build_tree([r.sequence.tokens for r in rows]).packing_ratio,
+        "packing_ratio": sum(len(r.sequence) for r in rows) / len(build_tree([r.sequence.tokens for r in rows]).tokens),
         "rows": len(rows),
     }
 

@@ -16,7 +16,7 @@ from trl import GRPOConfig
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import SpecError
+from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import defaults, field_rules
@@ -203,6 +203,11 @@ def check_calls(config: ScaffoldConfig) -> None:
             )
     temperatures = [("sampling.temperature", spec.sampling.temperature)]
     for kind in MODULE_KINDS:
+        if why := REGISTRY.get(kind, getattr(spec, kind).name).declaration.untrainable:
+            raise SpecError(
+                f"agent.{kind} {getattr(spec, kind).name!r} cannot be trained through: {why}; train inside a method of "
+                "this package, and evaluate with this one"
+            )
         if any(config.train_filter.matches(p) for p in paths if p.startswith(f"{kind}.")):
             given = getattr(spec, kind).params.items()
             temperatures += [(f"{kind}.{n}", v) for n, v in given if n.endswith("temperature") and v is not None]

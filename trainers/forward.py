@@ -7,7 +7,7 @@ and entropies are in the figures of the update, but they cost no backward pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -19,10 +19,11 @@ from torch.utils.checkpoint import checkpoint
 from agentspec.tokens import shared_prefix
 from trainers.frozen import LIMIT, FrozenOutput, language_model, output_of
 from trainers.logprobs import sampled_logprobs
+from trainers.lora import merged_lora
 from trainers.micro_batches import padding_row
 from trainers.sequences import Row, TokenSequence
-from trainers.tree.model import decoder_inputs, packed_inputs, wanted_tokens
-from trainers.tree.trie import Tree, build_tree
+from trainers.tree.model import Wanted, packed_inputs
+from trainers.tree.trie import build_tree
 
 Packing = Literal["tree", "padded"]
 Places = Sequence[tuple[int, int]]
@@ -35,9 +36,8 @@ FROZEN_TOKENS = 8192
 class Packed(NamedTuple):
     """Token lists as the inputs of one forward, shape (B, L), and where in it, flattened, the tokens of each are."""
 
-    inputs: dict[str, torch.Tensor]
+    inputs: dict[str, Any]
     places: Sequence[Sequence[int]]
-    tree: Tree | None = None
 
 
 def rows_logprobs(
@@ -67,7 +67,7 @@ def rows_logprobs(
     trained = [i for i, r in enumerate(rows) if r.sequence.trained]
     still = [i for i in trained if skip_backward and rows[i].zero_gradient]
     live = [i for i in trained if i not in set(still)]
-    forward = partial(_tree_forward if packing == "tree" else _padded_forward, frozen=frozen)
+    forward = partial(_forward, packing=packing, frozen=frozen)
     chunks = list(_chunks(rows, live, packing, tokens_per_forward))
     recompute = packing == "tree" and len(chunks) > 1 and torch.is_grad_enabled()
     # DDP arms its gradient reduction in forward, once per backward: the first forward is its own and is not repeated
@@ -142,49 +142,34 @@ def _chunks(rows: Sequence[Row], todo: list[int], packing: Packing, budget: int)
         yield chunk
 
 
-def _tree_forward(
+def _forward(
     model: nn.Module,
     sequences: Sequence[TokenSequence],
     places: Places,
     device: torch.device,
+    *,
+    packing: Packing,
     frozen: FrozenOutput | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probability and entropy of every place, from one packed forward."""
-    packed = _packed("tree", _read(sequences, places), device)
-    assert packed.tree is not None
-    wanted = wanted_tokens(
-        packed.tree,
-        [s.tokens for s in sequences],
-        places,
-        device,
-        temperatures=[sequences[r].temperatures[p] for r, p in places],
-        allowed=[sequences[r].allowed.get(p) for r, p in places],
+    """Log-probability and entropy of every place, from one forward."""
+    packed = _packed(packing, _read(sequences, places), device)
+    count, length = packed.inputs["input_ids"].shape
+    before = torch.tensor([packed.places[r][p - 1] for r, p in places], device=device)
+    wanted = Wanted(
+        before,
+        torch.tensor([sequences[r].tokens[p] for r, p in places], device=device),
+        torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device),
+        tuple(sequences[r].allowed.get(p) for r, p in places),
     )
-    with _started(frozen, sequences, packed):
-        output = model(**packed.inputs, **wanted)
-    return output.log_probs, output.entropies
-
-
-def _padded_forward(
-    model: nn.Module,
-    sequences: Sequence[TokenSequence],
-    places: Places,
-    device: torch.device,
-    frozen: FrozenOutput | None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probability and entropy of every place, from one padded forward."""
-    packed = _packed("padded", _read(sequences, places), device)
-    # The logits before a token decide it. Only positions that some row trains are projected on the vocabulary.
-    keep = sorted({p - 1 for _, p in places})
-    column = {p: k for k, p in enumerate(keep)}
-    with _started(frozen, sequences, packed):
-        logits = model(**packed.inputs, logits_to_keep=torch.tensor(keep, device=device), use_cache=False).logits
-    rows = torch.tensor([r for r, _ in places], device=device)
-    columns = torch.tensor([column[p - 1] for _, p in places], device=device)
-    tokens = torch.tensor([sequences[r].tokens[p] for r, p in places], device=device)
-    temperatures = torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device)
-    allowed = [sequences[r].allowed.get(p) for r, p in places]
-    return sampled_logprobs(logits[rows, columns], tokens, temperatures, allowed)
+    started = frozen.given(sequences, packed.places, (count, length)) if frozen else nullcontext()
+    with merged_lora(model), started:
+        if packing == "tree":
+            output = model(**packed.inputs, wanted=wanted)
+            return output.log_probs, output.entropies
+        # Only positions that some row trains are projected on the vocabulary.
+        keep, column = (before % length).unique(return_inverse=True)
+        logits = model(**packed.inputs, logits_to_keep=keep, use_cache=False).logits[before // length, column]
+    return sampled_logprobs(logits, wanted.tokens, wanted.temperatures, wanted.allowed)
 
 
 def _read(sequences: Sequence[TokenSequence], places: Places) -> list[list[int]]:
@@ -199,20 +184,12 @@ def _packed(packing: Packing, tokens: Sequence[list[int]], device: torch.device)
     """The inputs of one forward of all token lists: a prefix tree, or rows padded right."""
     if packing == "tree":
         tree = build_tree(tokens)
-        return Packed(packed_inputs(tree, device), tree.places, tree)
+        return Packed(packed_inputs(tree, device), tree.places)
     length = max(map(len, tokens))
     ids = torch.tensor([[*t, *[0] * (length - len(t))] for t in tokens], device=device)
     mask = torch.tensor([[1] * len(t) + [0] * (length - len(t)) for t in tokens], device=device)
     places = [range(i * length, i * length + len(t)) for i, t in enumerate(tokens)]
     return Packed({"input_ids": ids, "attention_mask": mask}, places)
-
-
-def _started(
-    frozen: FrozenOutput | None, sequences: Sequence[TokenSequence], packed: Packed
-) -> AbstractContextManager[None]:
-    if frozen is None:
-        return nullcontext()
-    return frozen.given(sequences, packed.places, tuple(packed.inputs["input_ids"].shape))
 
 
 def frozen_output(
@@ -231,28 +208,30 @@ def frozen_output(
         recorded: what the rollouts know of it; the rest is computed, `tokens_per_forward` at a time.
         limit: bytes of output to keep.
     """
+    if not layers:
+        return None
     decoder, weights = language_model(model).base_model, next(model.parameters())
+    width = decoder.config.hidden_size
     rows = sorted((r for r in rows if r.sequence.trained), key=lambda r: r.sequence.tokens)
     places = [(i, p) for i, r in enumerate(rows) for p, m in enumerate(r.sequence.mask) if m]
-    tokens = _read([r.sequence for r in rows], places)
-    tokens = _first(tokens, limit // (decoder.config.hidden_size * weights.element_size()))
-    if not layers or not tokens:
+    tokens = _first(_read([r.sequence for r in rows], places), limit // (width * weights.element_size()))
+    if not tokens:
         return None
     tree = build_tree(tokens)
-    known = list(map(recorded, tokens))
-    parts = [(there, states) for there, states in zip(tree.places, known, strict=True) if states is not None]
-    missing = [i for i, states in enumerate(known) if states is None]
+    states, missing = weights.new_empty(len(tree.tokens), width), []
+    for i, read in enumerate(tokens):
+        known = recorded(read)
+        if known is None:
+            missing.append(i)
+        else:
+            states[tree.places[i]] = known
     budget = tokens_per_forward or (FROZEN_TOKENS if packing == "tree" else 0)
     for chunk in _chunks(rows, missing, packing, budget):
         packed = _packed(packing, [tokens[i] for i in chunk], weights.device)
-        inputs = packed.inputs | (decoder_inputs(packed.tree, weights.device) if packed.tree else {})
-        states = output_of(decoder, layers, **inputs).flatten(0, 1)
-        parts += [(tree.places[i], states[list(here)]) for i, here in zip(chunk, packed.places, strict=True)]
-    first = parts[0][1]
-    whole = first.new_empty(len(tree.tokens), first.shape[-1])
-    for there, states in parts:
-        whole[there] = states
-    output = FrozenOutput(layers, whole)
+        found = output_of(decoder, layers, **packed.inputs).flatten(0, 1)
+        for i, here in zip(chunk, packed.places, strict=True):
+            states[tree.places[i]] = found[list(here)]
+    output = FrozenOutput(layers, states)
     for row, there in zip(rows, tree.places, strict=False):  # those that fit
         output.add(row.sequence, there)
     return output

@@ -7,7 +7,7 @@ Mixed into the trainer. TRL computes TRL's losses, from log-probabilities that a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -18,13 +18,9 @@ from trainers.finite import require_finite
 from trainers.forward import rows_logprobs
 from trainers.losses import divergence
 from trainers.micro_batches import PADDED, ROWS
+from trainers.mixin import Base
 from trainers.sequences import Row
 from trainers.vllm import importance_ratio
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 
 class PolicyLoss(Base):

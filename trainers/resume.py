@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -27,13 +27,9 @@ from agentspec.files import write_atomic
 from agentspec.registry import SpecError
 from trainers.folder_lock import hold
 from trainers.micro_batches import ROWS
+from trainers.mixin import Base
 from trainers.run_folder import STATE, TRAINER_STATE, set_aside
 from trainers.sequences import Row, TokenSequence
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 FORMAT = 2
 

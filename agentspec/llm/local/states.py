@@ -74,8 +74,8 @@ class StateRecorder:
             return
         for segment, (begin, end) in zip(segments, bounds, strict=True):
             if segment.source is not None:
-                segment.slot.states = up_to(segment.source.states, segment.start)
-            pieces = segment.slot.states
+                segment.slot.seen = up_to(segment.source.seen, segment.start)
+            pieces = segment.slot.seen
             while pieces and pieces[-1][0] >= segment.start:  # written over
                 pieces.pop()
             if pieces:
