@@ -109,8 +109,9 @@ class RecallItem:
     Args:
         text: as it is shown.
         score: relevance, on the method's own scale; for the record only.
-        kind: `episodic`, `summary`, `lesson`, ... Lessons are shown apart, within a budget of their own. A `step` does
-            nothing but tell one of the newest steps: it is left out where the prompt tells these anyway.
+        kind: `episodic`, `summary`, `lesson`, ... Lessons are shown apart, within a budget of their own. A `step` (or a
+            `failure`) does nothing but tell one of the newest steps, in their order: it is left out where the prompt
+            tells these anyway.
         source: module or entry it came from.
         priority: what to keep when not everything fits: the lowest goes first; of equals, what is listed last.
     """
