@@ -21,16 +21,26 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    DATA,
+    brief,
+    distinct,
+    first_held,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -76,7 +86,7 @@ def retention(elapsed: float, strength: float, unit: float = 1.0) -> float:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Record):
     """One memory: what it says, from when, how strong it is, and the step of the run at which it was last recalled."""
 
     kind: str
@@ -202,7 +212,8 @@ class MemoryBank:
             items.append(RecallItem(self._plan, 1.0, "insight", priority=2.5))
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
-            items += [RecallItem(self._named(e), 1.0, priority=4.0 + e.step) for e in newest]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -327,9 +338,10 @@ class MemoryBank:
         found: list[tuple[int, float]] = []
         for kind, index in self._index.items():
             hidden = max(0, now.step - shown_from) if kind == "raw" else 0
-            hits = index.search(query, self.quota[kind] + hidden) if self.quota[kind] else []
+            hits = index.search(query, 2 * self.quota[kind] + hidden) if self.quota[kind] else []
             if kind == "raw":
                 hits = [h for h in hits if not self._is_shown(self.entries[h[0]], now.episode, shown_from)]
+                hits = distinct(hits, lambda key: self.entries[key].text)
             found += hits[: self.quota[kind]]
         return found
 
@@ -374,9 +386,8 @@ class MemoryBank:
         return {**counts, "forgotten": self._forgotten, "mean_strength": strength}
 
     def snapshot(self) -> bytes:
-        entries = [[key, list(asdict(entry).values())] for key, entry in self.entries.items()]
         times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
-        return dump_state([entries, self.overview, self._merged, self._plan, self._task, times])
+        return dump_state([keyed(self.entries), self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
         entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)

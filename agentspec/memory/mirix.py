@@ -16,15 +16,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -99,7 +99,7 @@ class StoreEdit:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Record):
     """An entry: its store, its fields, and when it was written last."""
 
     store: str
@@ -200,7 +200,9 @@ class Mirix:
             for key, score in self._search(store, query, self.top if k is None else k):
                 items.append(RecallItem(f"[{store}] {self.entries[key].text}", score, store, str(key), 1.0 + score))
         if self.services.context.layout == "snapshot" and self.recent:
-            items += [RecallItem(text, priority=5.0 + i) for i, text in enumerate(self._steps[-self.recent :])]
+            count = self.services.llm.count_tokens
+            newest = enumerate(self._steps[-self.recent :])
+            items += [RecallItem(brief(text, count), priority=5.0 + i) for i, text in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -347,8 +349,7 @@ class Mirix:
         return {**sizes, "core_chars": len(self.core), **self._counts}
 
     def snapshot(self) -> bytes:
-        entries = [[key, list(asdict(entry).values())] for key, entry in self.entries.items()]
-        return dump_state([self.core, entries, self._steps, self._pending, self._task, self._counts])
+        return dump_state([self.core, keyed(self.entries), self._steps, self._pending, self._task, self._counts])
 
     def restore(self, blob: bytes) -> None:
         self.core, entries, self._steps, self._pending, self._task, self._counts = load_state(blob)
