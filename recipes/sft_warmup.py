@@ -39,24 +39,12 @@ def train_warmup(config: Any) -> None:
     shown = demonstrate(config.spec, tokenizer, make_tasks(name, options, config.train_tasks))
     returns = [float(t.metrics["return"]) for t in shown.episodes]
     print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(shown.rows)} rows")
-    args = SFTConfig(
-        output_dir=config.output_dir,
-        per_device_train_batch_size=config.per_device_train_batch_size,
-        gradient_accumulation_steps=config.gradient_accumulation_steps,
-        num_train_epochs=config.num_train_epochs,
-        max_steps=config.max_steps,
-        learning_rate=config.learning_rate,
-        lr_scheduler_type=config.lr_scheduler_type,
-        warmup_steps=config.warmup_steps,
-        max_length=None,
-        logging_steps=config.logging_steps,
-        save_strategy="no",
-        report_to=config.report_to,
-        use_cpu=config.use_cpu,
-        bf16=config.bf16,
-        **{CHECKPOINTING: getattr(config, CHECKPOINTING)},
-        seed=config.seed,
+    same = (
+        "output_dir per_device_train_batch_size gradient_accumulation_steps num_train_epochs max_steps learning_rate "
+        "lr_scheduler_type warmup_steps logging_steps report_to use_cpu bf16 seed"
     )
+    given = {field: getattr(config, field) for field in (*same.split(), CHECKPOINTING)}
+    args = SFTConfig(**given, max_length=None, save_strategy="no")
     data = Dataset.from_list(shown.rows)
     trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()
