@@ -5,7 +5,8 @@
     accelerate launch recipes/sft_warmup.py --environment '{"name": "alfred", "options": {"action_mode": "menu"}}'
 
 Any environment with an expert will do (`agentspec.envs.experts`). The first two made the adapters that ship
-(`agentspec/llm/shipped`). TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are context.
+(`agentspec/llm/shipped`). TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are
+context.
 """
 
 from __future__ import annotations

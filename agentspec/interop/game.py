@@ -12,7 +12,6 @@ from agentspec.types import ActionSchema, Task
 OVER = "The episode is over."
 
 
-
 class Game:
     """Plays episodes of one environment, one after the other.
 

@@ -8,7 +8,7 @@ observation, reads each reply as an action and answers with the next observation
 in the seat. `ScaffoldHarness` sits there itself and plays the whole episode with one of this package's agents, every
 model call of which goes through verifiers' endpoint and is in its trace.
 
-Needs `pip install 'agentspec-rl[verifiers]'`. Plugins are found by the name of a top-level module: `agentspec_verifiers`.
+Needs `pip install 'agentspec-rl[verifiers]'`. Plugins are found by a top-level module's name: `agentspec_verifiers`.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ class ScaffoldHarness(vf.Harness[ScaffoldConfig]):
             HarnessError: a task that is not a `WorldTaskset`'s.
         """
         if not isinstance(data, WorldData):
-            raise vf.HarnessError(f"the harness {self.config.id!r} plays tasks of agentspec-verifiers, got {type(data)}")
+            raise vf.HarnessError(
+                f"the harness {self.config.id!r} plays tasks of agentspec-verifiers, got {type(data)}"
+            )
         spec = AgentSpec.from_yaml(self.config.scaffold) if self.config.scaffold else AgentSpec()
         llm = OpenAILLM(ctx.model, base_url=endpoint, api_key=secret, max_retries=0)
         try:

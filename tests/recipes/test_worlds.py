@@ -18,7 +18,13 @@ from trainers.audit import audit
 from trainers.runlog import RunLog
 
 WARMUPS = {
-    "deliverybench": {"size": "tiny", "shift_hours": 0.1, "observation": "compact", "action_mode": "menu", "max_steps": 3},
+    "deliverybench": {
+        "size": "tiny",
+        "shift_hours": 0.1,
+        "observation": "compact",
+        "action_mode": "menu",
+        "max_steps": 3,
+    },
     "minigrid": {"suite": "memory", "observation": "compact", "action_mode": "menu"},
     "alfred": {"action_mode": "menu"},
     "robothor": {"action_mode": "menu"},

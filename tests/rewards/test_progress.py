@@ -1,4 +1,4 @@
-"""Efficiency, goal conditions and geodesic progress: exact values, and the worlds' own rewards as the second opinion."""
+"""Efficiency, goal conditions and geodesic progress: exact values, and the worlds' own rewards as a second opinion."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from tests.trainers.builders import episode
 def told(*reports, **metrics):
     """An episode whose steps report this, and what it came to."""
     played = episode([], rewards=[0.0] * len(reports))
-    steps = tuple(
-        replace(t, info={**t.info, **report}) for t, report in zip(played.transitions, reports, strict=True)
-    )
+    steps = tuple(replace(t, info={**t.info, **report}) for t, report in zip(played.transitions, reports, strict=True))
     return replace(played, transitions=steps, metrics=metrics)
 
 
@@ -74,7 +72,9 @@ def test_geodesic_progress_is_clipped_by_what_was_walked():
 def test_robothors_own_progress_is_the_same_plus_success(policy):
     found = played("robothor", {"reward": "progress", "max_steps": 40}, policy=policy)
     progress, success = paid("geodesic_progress", found), paid("success", found)
-    assert [t.reward for t in found.transitions] == pytest.approx([a + b for a, b in zip(progress, success, strict=True)])
+    assert [t.reward for t in found.transitions] == pytest.approx(
+        [a + b for a, b in zip(progress, success, strict=True)]
+    )
     if policy == "rule_based":
         # Stops at 1.5 m with the target in view, so the whole way to where it is seen was walked.
         assert sum(success) == 1.0 and sum(progress) > 0 and paid("efficiency", found)[-1] == found.metrics["spl"] > 0.9
