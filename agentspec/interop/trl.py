@@ -98,7 +98,7 @@ def environment_factory(env: str, options: Mapping[str, Any] | None = None, *, s
 def dataset(
     env: str, options: Mapping[str, Any] | None = None, *, count: int = 64, split: str = "train"
 ) -> list[dict[str, Any]]:
-    """Rows for `Dataset.from_list`: instruction as system text, an empty user turn for the observation, and the seed."""
+    """Rows for `Dataset.from_list`: instruction as system text, an empty user turn for what is observed, the seed."""
     game = Game(env, options)
     rows = []
     for task in make_tasks(env, dict(options or {}), count, split=split):
