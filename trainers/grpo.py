@@ -19,8 +19,7 @@ from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
 
-from agentspec.carry import FILE as MEMORY_FILE
-from agentspec.carry import MemoryBank, save_bank
+from agentspec.carry import MemoryBank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
@@ -41,7 +40,7 @@ from trainers.policy_loss import PolicyLoss
 from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, local_llm, rollout_jobs
-from trainers.round_metrics import episode_metrics, named, round_metrics
+from trainers.round_metrics import SamplingMetrics, episode_metrics, named, round_metrics
 from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
@@ -99,7 +98,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         self._round = 0
         self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
-        self._largest_difference: list[torch.Tensor] = []
+        self._sampling_metrics = SamplingMetrics()
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
@@ -191,16 +190,13 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
     def _carried_memory(self) -> bytes | None:
         """With `scope: run`: the bank of memories that the next round starts from, the same on every rank.
 
-        Each task carries the memory of one of its own rollouts. The main process keeps the bank as `memory.json`.
+        Each task carries the memory of one of its own rollouts.
         """
         if self.args.spec.scope != "run":
             return None
         bank = MemoryBank.of_spec(self.args.spec) if self._memory is None else MemoryBank.load(self._memory)
         played = [(e.trajectory.task.key, e.total, e.trajectory.memory_state) for e in self._played]
-        bank = bank.carried(gather_object(played), self.args.memory_carry)
-        if self.accelerator.is_main_process:
-            save_bank(self.run_log.folder / MEMORY_FILE, bank)
-        return bank.dump()
+        return bank.carried(gather_object(played), self.args.memory_carry).dump()
 
     # --- updates -----------------------------------------------------------------------------------------------------
 
@@ -278,18 +274,14 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             settings=settings(self.args.to_dict()),
         )
         if self.accelerator.is_main_process:
-            self.run_log.receipt(record, files)
+            self.run_log.receipt(record, files, self._memory)
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
         if self.model.training and not summary:
-            logs |= self._call_metrics.flush(gather_object)
-            differences = gather_object([d.item() for d in self._largest_difference])
-            self._largest_difference = []
-            if differences:
-                logs["sampling/logp_difference_max"] = torch.tensor(differences).max().item()
+            logs |= self._call_metrics.flush(gather_object) | self._sampling_metrics.flush(gather_object)
         super().log(logs, start_time)
-        if self.accelerator.is_main_process and not summary:
+        if self.accelerator.is_main_process and not summary and not self.run_log.sealed:
             step, name = self.state.global_step, METRICS if self.model.training else EVALUATIONS
             if not self.model.training:
                 self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again

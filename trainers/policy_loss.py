@@ -109,7 +109,7 @@ class PolicyLoss(Base):
             logps, entropies = rows_logprobs(model, inputs[ROWS], skip_backward=self._skip_backward, **self._packing)
         trained, current = inputs["tool_mask"], logps.detach()
         if self._step % self._steps_per_round < self.args.gradient_accumulation_steps:  # still those that sampled
-            self._largest_difference.append(((current - inputs["sampled_logprobs"]).abs() * trained).max())
+            self._sampling_metrics.differences.append((current - inputs["sampled_logprobs"]).abs()[trained > 0])
         old = inputs.get("old_per_token_logps", current)
         clipped = self.loss_spec.clipped(current, old, per_token_advantages(inputs), **self._limits)
         self._call_metrics.add(inputs[ROWS], entropies, clipped)
@@ -119,6 +119,7 @@ class PolicyLoss(Base):
             inputs["importance_sampling_ratio"] = importance_ratio(
                 old, inputs["sampled_logprobs"], trained, self.vllm_importance_sampling_mode, *bounds
             )
+            self._sampling_metrics.ratios.append(inputs["importance_sampling_ratio"][trained > 0])
         return logps, entropies, None
 
 
