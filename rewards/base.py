@@ -57,6 +57,15 @@ REWARDS: dict[str, RewardEntry] = {
     "delivery": RewardEntry("rewards.delivery:delivery", "shaping: +1 per order picked up, +1 per order delivered"),
     "env": RewardEntry("rewards.env:env_reward", "the environment's own reward"),
     "success": RewardEntry("rewards.outcome:success", "1 at the last step of an episode that succeeded"),
+    "efficiency": RewardEntry(
+        "rewards.outcome:efficiency", "how short a success was (efficiency or SPL), at the last step"
+    ),
+    "goal_progress": RewardEntry(
+        "rewards.progress:goal_progress", "change of the share of goal conditions that are met"
+    ),
+    "geodesic_progress": RewardEntry(
+        "rewards.progress:geodesic_progress", "metres come nearer over the shortest path's, clipped by metres moved"
+    ),
     "outcome": RewardEntry("rewards.outcome:outcome", "the environment's primary figure, at the last step"),
     "reflection_gain": RewardEntry(
         "rewards.reflection_gain:reflection_gain", "return less that of the trial whose lesson was followed; else 0"
