@@ -30,6 +30,7 @@ from agentspec.memory.parts.steps import (
     brief,
     distinct,
     first_held,
+    goal_of,
     newest_within,
     outcome,
     step_name,
@@ -49,7 +50,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"every": 2, "search": 6, "answer_tokens": 320, "steps_tokens": 768},
     "rl": {"every": 8, "search": 3, "answer_tokens": 192, "steps_tokens": 640},
 }
-TASK_TOKENS = 64
 TURN_TOKENS = 96
 NOTES = 6
 EDITS = 3
@@ -220,7 +220,7 @@ class OpenClaw:
         count = self.services.llm.count_tokens
         self._append(step_text(transition, self.state_tokens, count), transition.step)
         self._held_from = first_held(self.services, transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         if transition.terminated or transition.truncated:
             return
         if transition.step + 1 - self._since >= self.every:
