@@ -42,6 +42,9 @@ ARGUMENTS = (
     "input",
 )
 THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "analysis", "reason")
+PLANS = ("plan", "future_plan")
+MAX_PLAN = 500
+"""Signs of a plan that are kept."""
 MOST_OBJECTS = 16
 """Opening brackets that are tried before a text is taken to hold no data."""
 
@@ -81,6 +84,24 @@ def find_shape(text: str, schema: ActionSchema, start: int = 0) -> Shape | None:
         if found is not None:
             return Shape(found, at, _thought(data))
     return tagged
+
+
+def plan_of(text: str) -> str:
+    """The plan beside an action, as in `{"action": "WAIT(60)", "plan": "then fetch order 3"}`; "" where there is none.
+
+    `future_plan`, as DeliveryBench's own answers call it, and a list of steps will do.
+    """
+    start, end = text.find("{"), text.rfind("}")
+    if not 0 <= start < end or not any(f'"{key}"' in text for key in PLANS):
+        return ""
+    try:
+        data = json.loads(text[start : end + 1])
+    except (ValueError, RecursionError):
+        return ""
+    plan = next((data[key] for key in PLANS if data.get(key)), "") if isinstance(data, dict) else ""
+    if isinstance(plan, list):
+        plan = "; ".join(step for step in plan if isinstance(step, str))
+    return " ".join(plan.split())[:MAX_PLAN] if isinstance(plan, str) else ""
 
 
 def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | None:
@@ -125,7 +146,7 @@ def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  #
         return None
     if isinstance(data, list):
         if isinstance(data[0], str) and depth:
-            name = known_name(data[0], schema)
+            name = None if data[0] in schema.choices else known_name(data[0], schema)
             if name is not None:
                 return _build(name, data[1:] if not isinstance(data[-1], str) else [], schema)
             return data[0] if "(" in data[0] or data[0] in schema.choices else None
@@ -153,7 +174,7 @@ def _named(key: str, value: str, keys: Mapping[str, Any], schema: ActionSchema) 
     """The action named by `value` under `key`, with its arguments from beside it."""
     value = value.strip()
     name = known_name(value, schema)
-    if name is None:
+    if name is None or value.casefold() in map(str.casefold, schema.choices):
         # A whole call, a menu entry, or what shall be reported as unknown; a bare "name" may be anything's.
         return value or None if key not in ("name", "call", "function", "type") or "(" in value else None
     given = next((keys[a] for a in ARGUMENTS if a in keys), None)

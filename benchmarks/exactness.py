@@ -146,8 +146,7 @@ def group_advantages(name: str, members: Sequence[Rollout]) -> list[list[float]]
     if name == "reward_to_go":
         longest = max(map(len, togo))
         base = [sum(g[t] for g in togo if len(g) > t) / n for t in range(longest)]
-        flat = [v - base[t] for g in togo for t, v in enumerate(g)]
-        deviation = math.sqrt(sum(v * v for v in flat) / (len(flat) - 1))
+        deviation = sample_std([v - base[t] for g in togo for t, v in enumerate(g)])
         return [
             [(v - base[t]) / (deviation + 1e-4) if deviation > 1e-6 else 0.0 for t, v in enumerate(g)] for g in togo
         ]

@@ -20,7 +20,8 @@ counted: what is left is the method itself, whatever else the machine does. Per 
 A method that raises has its error in place of figures, and the exit code is 1.
 
 Beside them, where they are installed, libraries with the same sentences and vectors: `chromadb` (an ephemeral
-collection), `langmem` (its in-memory store) and `mem0ai` (its vector store without the model).
+collection), `langmem_store` (the store of LangGraph that LangMem writes into) and `mem0ai` (its local Qdrant, without
+the model); and `vector_index`, what this package's memories store in, without the bounds that a method sets.
 """
 
 from __future__ import annotations
@@ -307,7 +308,7 @@ def methods(names: Sequence[str] = ()) -> dict[str, Mapping[str, Mapping[str, An
     """Method -> its presets; all that are registered."""
     found: dict[str, Mapping[str, Mapping[str, Any]]] = {}
     for name, entry in REGISTRY.all("memory").items():
-        if (not names and name not in NOT_MEMORIES) or name in names:
+        if (not names and name not in NOT_MEMORIES and not entry.declaration.extra) or name in names:
             found[name] = {preset: {"preset": preset} for preset in entry.presets} or {"": {}}
     for name in set(names) - set(found) - set(LIBRARIES):
         entry = REGISTRY.get("memory", name)  # an alias, or an error with the nearest names

@@ -103,10 +103,17 @@ class RewardSet:
 
     Args:
         weights: registered name, or `module:function`, -> weight. Default: `earning_delta` alone.
+
+    Raises:
+        SpecError: no reward, an unknown one, or a weight that is not finite.
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
-        self.weights = dict(weights or {"earning_delta": 1.0})
+        self.weights = {"earning_delta": 1.0} if weights is None else dict(weights)
+        if not self.weights:
+            raise SpecError(
+                "rewards is {}, which pays nothing; name one (`rewards: {earning_delta: 1.0}`), or leave it out"
+            )
         for name, weight in self.weights.items():
             if not math.isfinite(weight):
                 raise SpecError(f"reward {name!r} has weight {weight}; expected a finite number")

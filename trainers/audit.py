@@ -17,6 +17,7 @@ compared field by field, so that
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from typing import Any
 
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers.chain import Manifests, check_end, files_of, linked_receipts, read_round
+from trainers.chain import check_end, files_of, linked_receipts, manifest_of, read_manifests, read_round
 from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import attach
 from trainers.credit import CreditRule
@@ -36,16 +37,20 @@ from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.run_folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
 from trainers.sequences import Row
 
-TOLERANCE = 1e-6
+TOLERANCE, SMALLEST = 1e-9, 1e-12
+"""Relative and absolute: numbers that differ by less are the rounding of another machine (they repeat on one)."""
 SHOWN = 5
 """Differences of one kind that are listed one by one."""
 
 
 @dataclass
 class UpdateAudit:
-    """What the audit found of one update; `notes` say what it could not look at."""
+    """What the audit found of one update, or (`round` is `None`) of the run as a whole.
 
-    round: int
+    `notes` say what it could not look at.
+    """
+
+    round: int | None
     episodes: int = 0
     unscorable: int = 0
     rows: int = 0
@@ -66,18 +71,16 @@ class UpdateAudit:
             f"({self.zero_gradient_rows} without gradient, {self.padding_rows} padding), {self.tokens} tokens, "
             f"{self.trained} trained, denominator {self.denominator}; trained by call: {tags}"
         )
+        head = "the run as a whole:" if self.round is None else head
         return [head, *(f"  VIOLATION {v}" for v in self.violations), *(f"  note: {n}" for n in self.notes)]
 
 
 def audit(run: str | Path, step: int | None = None, *, head: str = "") -> Iterator[UpdateAudit]:
-    """Audit every update of a run folder, or one.
-
-    What is wrong with the run as a whole is told of its first (the manifest) or last update (whatever has no receipt,
-    the seal); with `step`, the end of the run is not looked at.
+    """Audit every update of a run folder, or one; last, if there is anything to say of it, the run as a whole.
 
     Args:
         run: the run's `output_dir`.
-        step: only the update of this generation round.
+        step: only the update of this generation round; the end of the run is then not looked at.
         head: the head of the chain that the run printed at its end, kept outside the folder.
 
     Raises:
@@ -85,59 +88,42 @@ def audit(run: str | Path, step: int | None = None, *, head: str = "") -> Iterat
     """
     folder = Path(run)
     if not (folder / MANIFEST).is_file() or not ((folder / UPDATES).is_file() or (folder / TRAJECTORIES).is_dir()):
-        missing = "its manifest.json was removed" if holds_run(folder) and not (folder / MANIFEST).is_file() else ""
+        removed = " (its manifest.json was removed)" if holds_run(folder) and not (folder / MANIFEST).is_file() else ""
         raise SpecError(
-            f"{folder} holds no training run: expected manifest.json and updates.jsonl"
-            f"{f' ({missing})' if missing else ''}; give the run's output_dir"
+            f"{folder} holds no training run: expected manifest.json and updates.jsonl{removed}; give the run's "
+            "output_dir"
         )
-    manifests = Manifests.read(folder)
-    seen: list[tuple[int, set[str], int]] = []
-    waiting: UpdateAudit | None = None
-    problems = list(manifests.problems)
+    manifests, problems = read_manifests(folder)
+    rounds = []
     for record, broken in linked_receipts(folder):
-        number = record["round"] if isinstance(record.get("round"), int) else -1
-        seen.append((number, set(files_of(record)), _steps_per_round(record)))
-        if step is not None and number != step:
-            continue
-        if waiting is not None:
-            yield waiting
-        waiting = _audit_update(folder, number, record, manifests, [*problems, *broken])
-        problems = []
-    if step is not None and waiting is None:
-        raise SpecError(f"{folder} has no update {step}; it has {[number for number, _, _ in seen]}")
-    last = waiting or UpdateAudit(-1, violations=problems)
+        rounds.append(record["round"] if isinstance(record.get("round"), int) else -1)
+        if step in (None, rounds[-1]):
+            yield _audit_update(folder, rounds[-1], record, manifests, broken)
+    if step is not None and step not in rounds:
+        raise SpecError(f"{folder} has no update {step}; it has {rounds}")
+    whole = UpdateAudit(None, violations=problems)
     if step is None:
-        wrong, notes = check_end(folder, seen, head)
-        last.violations += wrong
-        last.notes += notes
-    if waiting is not None or last.violations:
-        yield last
-
-
-def _steps_per_round(record: Mapping[str, Any]) -> int:
-    """Optimiser steps that are made of one generation round."""
-    given = record.get("settings")
-    names = ("steps_per_generation", "num_iterations", "gradient_accumulation_steps")
-    values = [given.get(name) for name in names] if isinstance(given, Mapping) else []
-    counts = [v for v in values if isinstance(v, int) and v > 0]
-    return max(1, counts[0] * counts[1] // counts[2]) if len(counts) == 3 else 1
+        wrong, whole.notes = check_end(folder, manifests[next(reversed(manifests))]["config"], head)
+        whole.violations += wrong
+    if whole.violations or whole.notes:
+        yield whole
 
 
 def _audit_update(
-    folder: Path, number: int, record: Mapping[str, Any], manifests: Manifests, problems: list[str]
+    folder: Path, number: int, record: Mapping[str, Any], manifests: Mapping[str, dict[str, Any]], problems: list[str]
 ) -> UpdateAudit:
     finding = UpdateAudit(number, violations=problems)
-    config = manifests.of(record, problems)["config"]
     try:
         finding.denominator, finding.padding_rows = int(record["denominator"]), int(record["padding_rows"])
+        config = manifest_of(record, manifests, problems)["config"]
         read = read_round(folder, record, problems)
         episodes, beside = read[TRAJECTORIES], read[COUNTERFACTUALS]
         finding.episodes = len(episodes)
         finding.unscorable = sum(not t.scorable for t in episodes)
         if not episodes:
             problems.append(f"the episodes of this update are missing ({folder / TRAJECTORIES})")
-            return finding
-        _check_update(finding, record, episodes, beside, config)
+        else:
+            _check_update(finding, record, episodes, beside, config)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
         problems.append(f"the record cannot be followed ({type(error).__name__}: {error})")
     return finding
@@ -151,38 +137,35 @@ def _check_update(
     config: Mapping[str, Any],
 ) -> None:
     """The receipt, made anew from its episodes and the manifest, and what it may not contain."""
-    rule = CreditRule.from_manifest(config)
+    rule, told = CreditRule.from_manifest(config), finding.violations
     if len(episodes) % rule.group:
-        finding.violations.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
+        told.append(f"{len(episodes)} episodes are no whole groups of {rule.group}")
         return
-    scored = attach(rule.score(episodes), beside, rule, finding.violations)
+    scored = attach(rule.score(episodes), beside, rule, told)
     rows = rule.credit(scored).rows
     finding.rows = len(rows)
     finding.zero_gradient_rows = sum(r.zero_gradient for r in rows)
     finding.tokens = sum(len(r.sequence) for r in rows)
     finding.trained = sum(r.sequence.trained for r in rows)
-    size = UpdateSize(finding.trained, len(episodes), config["max_completion_length"])
+    ranks = max(1, sum(name.startswith(f"{TRAJECTORIES}/") for name in files_of(record)))  # each has its own file
     again = receipt_record(
-        round=finding.round,
+        round=finding.round or 0,
         played=[(e.trajectory.episode, e.total) for e in scored],
         rows=receipt_rows(rows),
-        padding_rows=padding_rows(rows, len(episodes), _ranks(record), config["steps_per_generation"]),
-        denominator=loss(config["loss_type"]).denominator(size),
+        padding_rows=padding_rows(rows, len(episodes), ranks, config["steps_per_generation"]),
+        denominator=loss(config["loss_type"]).denominator(
+            UpdateSize(finding.trained, len(episodes), config["max_completion_length"])
+        ),
         settings=settings(config),
     )
-    given = {name: value for name, value in record.items() if name != "chain"}
-    differences = list(_differences(again, given))
-    finding.violations += [f"{UPDATES}, update {finding.round}: {what}" for what in differences[:SHOWN]]
+    differences = list(_differences(again, {name: value for name, value in record.items() if name != "chain"}))
+    told += [f"{UPDATES}, update {finding.round}: {what}" for what in differences[:SHOWN]]
     if len(differences) > SHOWN:
-        finding.violations.append(f"{UPDATES}, update {finding.round}: {len(differences) - SHOWN} more fields differ")
-    _check_policy(finding, episodes)
-    _check_advantages(finding, rows, episodes, rule)
-    _check_samples(finding, rows, episodes)
-
-
-def _ranks(record: Mapping[str, Any]) -> int:
-    """Processes that played the round: each has a file of its own."""
-    return max(1, sum(name.startswith(f"{TRAJECTORIES}/") for name in files_of(record)))
+        told.append(f"{UPDATES}, update {finding.round}: {len(differences) - SHOWN} more fields differ")
+    if strangers := [t.episode for t in episodes if t.policy != f"step-{finding.round}"]:
+        told.append(f"episodes {strangers} were not played by policy step-{finding.round}")
+    told += check_sums(rows, [e.total for e in scored], rule)
+    finding.by_tag = dict(check_samples(rows, episodes, told))
 
 
 def padding_rows(rows: Sequence[Row], episodes: int, ranks: int, micro_batches: int) -> int:
@@ -211,42 +194,30 @@ def _differences(again: Any, given: Any, where: str = "") -> Iterator[str]:
 
 
 def _equal(a: Any, b: Any) -> bool:
-    """The same type of value, numbers up to the tolerance."""
+    """The same type of value, numbers up to the rounding of another machine."""
     if isinstance(a, float) and isinstance(b, (int, float)) and not isinstance(b, bool):
-        return math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+        return math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=SMALLEST)
     return type(a) is type(b) and bool(a == b)
 
 
-def _check_policy(finding: UpdateAudit, episodes: Sequence[Trajectory]) -> None:
-    """Every episode was played by the policy of this update."""
-    expected = f"step-{finding.round}"
-    strangers = [t.episode for t in episodes if t.policy != expected]
-    if strangers:
-        finding.violations.append(f"episodes {strangers} were not played by policy {expected}")
+def check_sums(rows: Sequence[Row], returns: Sequence[float | None], rule: CreditRule) -> Iterator[str]:
+    """Advantages of a group sum to zero, where the estimator says so and every member that counts has rows.
 
-
-def _check_advantages(
-    finding: UpdateAudit, rows: Sequence[Row], episodes: Sequence[Trajectory], rule: CreditRule
-) -> None:
-    """Constant over a rollout (estimators per episode), and zero in sum over a group where the estimator says so."""
+    Up to rounding: returns that are large beside their spread lose digits when their mean is taken off.
+    """
     spec = estimator(rule.estimator)
-    if spec.per_step:
+    if spec.per_step or not spec.zero_sum or rule.normalize == "rollout":
         return
-    values: dict[int, float] = {}
-    for row in rows:
-        of_actions = _of_actions(row, rule)
-        if len(of_actions) > 1 or any(values.setdefault(row.episode, a) != a for a in of_actions):
-            finding.violations.append(f"episode {row.episode} has rows with different advantages")
-    if rule.normalize == "rollout" or not spec.zero_sum:
-        return  # each rollout's value is scaled by its own length; they were compared one by one already
-    for start in range(0, len(episodes), rule.group):
-        members = [i for i in range(start, start + rule.group) if episodes[i].scorable]
-        if all(i in values for i in members):  # masked or skipped members have no rows to sum over
-            given = [values[i] for i in members]
-            if abs(math.fsum(given)) > TOLERANCE * max(1.0, math.fsum(map(abs, given))):
-                finding.violations.append(
-                    f"advantages of group {start // rule.group} sum to {math.fsum(given):.2g}, not 0"
-                )
+    given = {row.episode: value for row in rows for value in _of_actions(row, rule)}
+    for start in range(0, len(returns), rule.group):
+        earned = {i: r for i, r in enumerate(returns[start : start + rule.group], start) if r is not None}
+        if not all(i in given for i in earned):  # masked or skipped members have no rows to sum over
+            continue
+        total, size = math.fsum(given[i] for i in earned), math.fsum(abs(given[i]) for i in earned)
+        spread = max(earned.values(), default=0.0) - min(earned.values(), default=0.0)
+        lost = sys.float_info.epsilon * len(earned) * max(map(abs, earned.values()), default=0.0) / (spread or 1.0)
+        if abs(total) > size * (TOLERANCE + lost):
+            yield f"advantages of group {start // rule.group} sum to {total:.2g}, not 0"
 
 
 def _of_actions(row: Row, rule: CreditRule) -> set[float]:
@@ -258,15 +229,15 @@ def _of_actions(row: Row, rule: CreditRule) -> set[float]:
     return {a for a, m, c in zip(row.advantage, s.mask, s.calls, strict=True) if m and c not in wrote}
 
 
-def _check_samples(finding: UpdateAudit, rows: Sequence[Row], episodes: Sequence[Trajectory]) -> None:
-    """Every token of a row has an origin, and every recorded completion is possible."""
+def check_samples(rows: Sequence[Row], episodes: Sequence[Trajectory], problems: list[str]) -> Counter[str]:
+    """Trained tokens by call; every token of a row has an origin, and every recorded completion is possible."""
     by_tag: Counter[str] = Counter()
     for row in rows:
-        problems, counted = check_tokens(row.sequence, episodes[row.episode])
-        finding.violations += problems
+        found, counted = check_tokens(row.sequence, episodes[row.episode])
+        problems += found
         by_tag += counted
-    finding.by_tag = dict(by_tag)
-    for trajectory in episodes:
-        for call in trajectory.calls:
+    for t in episodes:
+        for call in t.calls:
             for completion in call.completions:
-                finding.violations += check_completion(completion, f"call {call.id} of {trajectory.episode}")
+                problems += check_completion(completion, f"call {call.id} of {t.episode}")
+    return by_tag

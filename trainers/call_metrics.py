@@ -6,8 +6,8 @@ summaries and leaves the actions alone shows here, and nowhere else.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -16,25 +16,11 @@ from agentspec.trajectory import Trajectory
 from trainers.sequences import Row, TrainFilter
 
 
-@dataclass
-class CallTotals:
-    """Sums over the trained tokens of one path; `entropy` in nats."""
-
-    tokens: int = 0
-    advantage: float = 0.0
-    entropy: float = 0.0
-    clipped: int = 0
-
-    def plus(self, other: CallTotals) -> CallTotals:
-        """The totals of both."""
-        return CallTotals(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
-
-
 class CallMetrics:
-    """Gathers the totals of micro-batches until they are logged."""
+    """Gathers, per path, sums over its trained tokens until they are logged."""
 
     def __init__(self) -> None:
-        self._totals: dict[str, CallTotals] = {}
+        self._totals: defaultdict[str, Any] = defaultdict(Counter)
 
     def add(self, rows: Sequence[Row], entropies: torch.Tensor, clipped: torch.Tensor) -> None:
         """Count one micro-batch.
@@ -45,15 +31,13 @@ class CallMetrics:
         """
         for row, entropy, cut in zip(rows, entropies.tolist(), clipped.tolist(), strict=True):
             sequence = row.sequence
-            for place, trained in enumerate(sequence.mask):
-                if not trained:
-                    continue
-                totals = self._totals.setdefault(sequence.paths[sequence.calls[place]], CallTotals())
+            for place in (i for i, trained in enumerate(sequence.mask) if trained):
+                totals = self._totals[sequence.paths[sequence.calls[place]]]
                 advantage = row.advantage if isinstance(row.advantage, int | float) else row.advantage[place]
-                totals.tokens += 1
-                totals.advantage += abs(advantage)
-                totals.entropy += entropy[place - 1]
-                totals.clipped += bool(cut[place - 1])
+                totals["tokens"] += 1
+                totals["advantage"] += abs(advantage)
+                totals["entropy"] += entropy[place - 1]
+                totals["clipped"] += bool(cut[place - 1])
 
     def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
         """Metrics of what was counted since the last time, over all ranks.
@@ -61,17 +45,17 @@ class CallMetrics:
         Per path: `tokens` (trained), `advantage_mass` (its share of the sum of absolute advantages over trained
         tokens), `entropy` (mean, nats), `clip_share` (of its tokens).
         """
-        everywhere: dict[str, CallTotals] = {}
+        everywhere: defaultdict[str, Any] = defaultdict(Counter)
         for path, totals in gather(list(self._totals.items())):
-            everywhere[path] = everywhere.get(path, CallTotals()).plus(totals)
-        self._totals = {}
-        mass = sum(t.advantage for t in everywhere.values())
+            everywhere[path].update(totals)
+        self._totals = defaultdict(Counter)
+        mass = sum(t["advantage"] for t in everywhere.values())
         metrics: dict[str, float] = {}
         for path, t in sorted(everywhere.items()):
-            metrics[f"calls/{path}/tokens"] = float(t.tokens)
-            metrics[f"calls/{path}/advantage_mass"] = t.advantage / mass if mass else 0.0
-            metrics[f"calls/{path}/entropy"] = t.entropy / t.tokens
-            metrics[f"calls/{path}/clip_share"] = t.clipped / t.tokens
+            metrics[f"calls/{path}/tokens"] = float(t["tokens"])
+            metrics[f"calls/{path}/advantage_mass"] = t["advantage"] / mass if mass else 0.0
+            metrics[f"calls/{path}/entropy"] = t["entropy"] / t["tokens"]
+            metrics[f"calls/{path}/clip_share"] = t["clipped"] / t["tokens"]
         return metrics
 
 

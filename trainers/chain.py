@@ -7,118 +7,86 @@ author did not compute all later digests anew. Who did can be told by the head o
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
+from trainers import run_folder
 from trainers.digests import differing, field_digests
-from trainers.run_folder import CHECKPOINT, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES, checkpoints
-from trainers.runlog import FORMAT, round_files, seal_of
-
-SHOWN = 20
-"""Edited records of one file that are listed one by one."""
+from trainers.run_folder import MANIFEST, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.runlog import FORMAT, digest_of, round_files, seal_of
 
 
-# --- manifests -------------------------------------------------------------------------------------------------------
+def read_manifests(folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """All manifests of a run by digest, the present one last, and what is wrong with them.
 
-
-@dataclass
-class Manifests:
-    """All manifests of a run by digest, the present one last, and what is wrong with them."""
-
-    by_digest: dict[str, dict[str, Any]] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-
-    @classmethod
-    def read(cls, folder: Path) -> Manifests:
-        """Read them.
-
-        Raises:
-            SpecError: the present one is not the manifest of a training run.
-        """
-        found = cls()
-        before = ""
-        for path in (*sorted((folder / MANIFESTS).glob("*.json")), folder / MANIFEST):
-            name = path.relative_to(folder).as_posix()
-            key = file_digest(path)
-            if key in found.by_digest:
-                continue
-            data = _manifest(path)
-            edited = differing(data.get("digests"), field_digests({k: v for k, v in data.items() if k != "digests"}))
-            found.problems += [f"{name}: {what} was edited" for what in edited]
-            if data.get("previous") != before:
-                found.problems.append(f"{name}: the manifest before it was edited, deleted or replaced (`previous`)")
-            found.by_digest[key] = data
-            before = key
-        return found
-
-    def of(self, record: Mapping[str, Any], problems: list[str]) -> dict[str, Any]:
-        """The manifest that a receipt names; the present one, and a problem, if there is none."""
-        named = _chain(record).get("manifest")
-        if named not in self.by_digest:
-            problems.append(
-                f"{MANIFEST} is not the one that the receipt names (`chain.manifest`): one of them was edited"
-            )
-        return self.by_digest.get(str(named)) or next(reversed(self.by_digest.values()))
+    Raises:
+        SpecError: one is not the manifest of a training run, or of another format.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    problems, before = [], ""
+    for path in (*sorted((folder / run_folder.MANIFESTS).glob("*.json")), folder / MANIFEST):
+        name, key = path.relative_to(folder).as_posix(), file_digest(path)
+        if key in found:
+            continue
+        data = found[key] = _manifest(path)
+        edited = differing(data.get("digests"), field_digests({k: v for k, v in data.items() if k != "digests"}))
+        problems += [f"{name}: {what} was edited" for what in edited]
+        if data.get("previous") != before:
+            problems.append(f"{name}: the manifest before it was edited, deleted or replaced (`previous`)")
+        before = key
+    return found, problems
 
 
 def _manifest(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise SpecError(f"{path} is not JSON ({error}); the run's record is damaged") from error
-    if not isinstance(data, dict) or not isinstance(data.get("config"), dict):
-        raise SpecError(f"{path} names no configuration: it is not the manifest of a training run")
+        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _ = data["config"]["output_dir"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise SpecError(f"{path} is not the manifest of a training run ({type(error).__name__}: {error})") from error
+    if data.get("format") != FORMAT:
+        raise SpecError(
+            f"{path} has format {data.get('format')!r}, expected {FORMAT}; audit it with the version that wrote it "
+            "(`versions`), if it was not edited"
+        )
     return data
 
 
-# --- receipts --------------------------------------------------------------------------------------------------------
+def manifest_of(
+    record: Mapping[str, Any], manifests: Mapping[str, dict[str, Any]], problems: list[str]
+) -> dict[str, Any]:
+    """The manifest that a receipt names; the present one, and a problem, if there is none."""
+    named = chain_of(record).get("manifest")
+    if named not in manifests:
+        problems.append(f"{MANIFEST} is not the one that the receipt names (`chain.manifest`): one of them was edited")
+    return manifests.get(str(named)) or list(manifests.values())[-1]
 
 
 def linked_receipts(folder: Path) -> Iterator[tuple[dict[str, Any], list[str]]]:
-    """Every receipt with what is wrong with its place in the chain.
-
-    A link that does not hold is told of the earlier of its two receipts: it was edited, or what follows it is not what
-    did. Only what the next receipt says of a receipt can tell.
-    """
-    path = folder / UPDATES
-    numbers = {digest(line): number for number, line in whole_lines(path)}
-    held: tuple[dict[str, Any], list[str], str] | None = None
+    """Every receipt with what is wrong with its place in the chain."""
+    path, before = folder / UPDATES, ""
     for number, line in whole_lines(path):
         record = parse_line(path, number, line)
-        problems: list[str] = []
-        if record.get("format") != FORMAT:
-            problems.append(f"record {number} has format {record.get('format')!r}, expected {FORMAT} (`format`)")
-        previous = _chain(record).get("previous")
-        if held is None:
-            if previous != "":
-                problems.append(f"record {number} was not the first: those before it were deleted (`chain.previous`)")
-        elif previous != held[2]:
-            place = numbers.get(str(previous))
-            what = f"followed record {place}: records were moved, deleted or doubled" if place else "was edited, or"
-            what = what if place else "follows a record that is not here: the one before it was edited or deleted"
-            (held[1] if not place else problems).append(f"record {number} of {UPDATES} {what} (`chain.previous`)")
-        if held is not None:
-            yield held[0], held[1]
-        held = record, problems, digest(line)
-    if held is not None:
-        yield held[0], held[1]
+        held = chain_of(record).get("previous") == before
+        told = f"{UPDATES}, record {number}: what it followed was edited, deleted, doubled or moved (`chain.previous`)"
+        yield record, [] if held else [told]
+        before = digest(line)
 
 
-def _chain(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    chain = record.get("chain")
-    return chain if isinstance(chain, Mapping) else {}
+def chain_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a receipt says of other records."""
+    return _mapping(record.get("chain"))
 
 
-def files_of(record: Mapping[str, Any]) -> dict[str, Any]:
+def files_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
     """What a receipt says of its round's files."""
-    files = _chain(record).get("files")
-    return dict(files) if isinstance(files, Mapping) else {}
+    return _mapping(chain_of(record).get("files"))
 
 
 def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> dict[str, list[Trajectory]]:
@@ -129,11 +97,10 @@ def read_round(folder: Path, record: Mapping[str, Any], problems: list[str]) -> 
     present = {p.relative_to(folder).as_posix(): p for p in round_files(folder)}
     episodes: dict[str, list[Trajectory]] = defaultdict(list)
     for name, stated in sorted(files_of(record).items(), key=lambda item: (_rank(item[0]), item[0])):
-        if name not in present:
+        if name in present:
+            episodes[name.partition("/")[0]] += _read_file(present[name], name, _mapping(stated), problems)
+        else:
             problems.append(f"{name} is missing")
-            continue
-        read = _read_file(present[name], name, stated if isinstance(stated, Mapping) else {}, problems)
-        episodes[name.partition("/")[0]] += read
     return episodes
 
 
@@ -144,130 +111,114 @@ def _rank(name: str) -> int:
 
 def _read_file(path: Path, name: str, stated: Mapping[str, Any], problems: list[str]) -> list[Trajectory]:
     """The episodes of one file, compared record by record with what the receipt states of it."""
-    known = stated.get("episodes")
-    known = known if isinstance(known, Sequence) else []
-    episodes, told, count = [], len(problems), 0
-    for number, line in whole_lines(path):
-        count += 1
+    known = stated["episodes"] if isinstance(stated.get("episodes"), list) else []
+    lines, episodes, told = list(whole_lines(path)), [], len(problems)
+    for place, (number, line) in enumerate(lines):
         data = parse_line(path, number, line)
-        expected = known[count - 1] if count <= len(known) else {}
-        edited = differing(expected, field_digests(data))
+        which = f"{name}, record {number}"
         try:
             episodes.append(Trajectory.from_data(data))
-            which = f"record {number} ({episodes[-1].episode})"
+            which = f"{which} ({episodes[-1].episode})"
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            which = f"record {number}"
-            problems.append(f"{name}, {which} is no trajectory any more ({type(error).__name__}: {error})")
-        if edited and count <= len(known):
-            problems.append(f"{name}, {which}: edited: {', '.join(edited)}")
-    if count != len(known):
-        problems.append(f"{name} has {count} records, the receipt names {len(known)}")
+            problems.append(f"{which} is no trajectory any more ({type(error).__name__}: {error})")
+        if place < len(known) and (edited := differing(known[place], field_digests(data))):
+            problems.append(f"{which}: edited: {', '.join(edited)}")
+    if len(lines) != len(known):
+        problems.append(f"{name} has {len(lines)} records, the receipt names {len(known)}")
     if file_digest(path) != stated.get("digest") and len(problems) == told:
         problems.append(f"{name} or its digest in the receipt (`chain.files`) was edited; its records read as before")
     return episodes
 
 
-# --- the end of the chain --------------------------------------------------------------------------------------------
-
-
-def check_end(
-    folder: Path, receipts: Sequence[tuple[int, set[str], int]], head: str = ""
-) -> tuple[list[str], list[str]]:
+def check_end(folder: Path, config: Mapping[str, Any], head: str = "") -> tuple[list[str], list[str]]:
     """What is wrong with the end of the chain, and what nobody can tell.
 
     Args:
-        receipts: of each receipt its round, the names of its files, and the optimiser steps that its round makes.
+        config: of the present manifest.
         head: what the run printed at its end; empty: not known.
     """
-    problems, notes = _check_seal(folder, head)
+    named, carried, last, reached = set[str](), [""], -1, 0
+    for record, _ in linked_receipts(folder):
+        named |= set(files_of(record))
+        carried.append(str(chain_of(record).get("memory", "")))
+        last = record["round"] if isinstance(record.get("round"), int) else last
+        reached = max(reached, last + _steps_per_round(record))
     sealed = (folder / SEAL).is_file()
-    last = max((number for number, _, _ in receipts), default=-1)
-    named = set().union(*(files for _, files, _ in receipts))
-    for path in round_files(folder):
-        name = path.relative_to(folder).as_posix()
-        if name not in named and (sealed or not int(path.name[:6]) > last):
-            problems.append(f"{name}: no receipt names it")
-    known = {p.name for p in round_files(folder)}
-    for path in sorted((folder / TRAJECTORIES).glob("*")):
-        if path.name not in known and not path.name.startswith("."):
-            problems.append(f"{TRAJECTORIES}/{path.name}: no receipt names it, and no round has a file of that name")
-    reached = max((number + steps for number, _, steps in receipts), default=0)
+    problems = _check_seal(folder, head) if sealed else []
     steps = {METRICS: max((_step(line) for _, line in whole_lines(folder / METRICS)), default=0)}
-    steps |= {p.name: int(p.name.removeprefix(f"{CHECKPOINT}-")) for p in checkpoints(folder)}
-    for name, number in steps.items():
-        if number > reached:
-            problems.append(
-                f"{name} is of step {number}, but the receipts end at step {reached}: later ones are missing"
-            )
-    return problems, notes
+    steps |= {p.name: int(p.name.rpartition("-")[2]) for p in run_folder.checkpoints(folder)}
+    problems += [
+        f"{name} is of step {step}, but the receipts end at step {reached}: later ones are missing"
+        for name, step in steps.items()
+        if step > reached
+    ]
+    for path in sorted({*round_files(folder), *(folder / TRAJECTORIES).glob("[!.]*")}):
+        name, number = path.relative_to(folder).as_posix(), path.name[:6]
+        if name not in named and (sealed or not number.isdigit() or int(number) <= last):  # else a round under way
+            problems.append(f"{name}: no receipt names it")
+    if digest_of(folder / MEMORY) not in carried[-1 if sealed else -2 :]:  # it is written after the receipt
+        problems.append(f"{MEMORY} is not what the last receipt says (`chain.memory`): it was edited or replaced")
+    if sealed:
+        return problems, []
+    if head or max(steps.values()) >= _wanted(folder, config):
+        why = f"the head {head} is that of a run that had ended" if head else f"all {reached} steps were made"
+        return [*problems, f"{SEAL} is missing, and {why}: it was deleted, or the run killed at its very end"], []
+    return problems, [f"no {SEAL}: interrupted or under way after update {last}; nothing after its receipt is covered"]
+
+
+def _steps_per_round(record: Mapping[str, Any]) -> int:
+    """Optimiser steps that are made of one generation round."""
+    given = _mapping(record.get("settings"))
+    names = ("steps_per_generation", "num_iterations", "gradient_accumulation_steps")
+    made, repeated, taken = (n if isinstance(n := given.get(name), int) and n > 0 else 1 for name in names)
+    return max(1, made * repeated // taken)
 
 
 def _step(line: bytes) -> int:
-    try:
+    with suppress(ValueError, AttributeError):
         step = json.loads(line).get("step")
-    except (ValueError, AttributeError):
-        return 0
-    return step if isinstance(step, int) else 0
+        return step if isinstance(step, int) else 0
+    return 0
 
 
-def _check_seal(folder: Path, head: str) -> tuple[list[str], list[str]]:
-    path = folder / SEAL
-    if not path.is_file():
-        if head:
-            return [f"{SEAL} is missing, and the head {head} is that of a run that had ended"], []
-        return [], [f"no {SEAL}: the run has not ended, or was cut short; what stood after its last receipt is unknown"]
-    problems: list[str] = []
-    blob = path.read_bytes()
-    try:
-        seal = json.loads(blob)
-    except ValueError as error:
-        return [f"{SEAL} is not JSON ({error})"], []
-    expected = seal_of(folder)
-    if not isinstance(seal, dict):
-        return [f"{SEAL} is no seal"], []
-    for name in sorted({*seal, *expected}):
-        if seal.get(name) != expected.get(name):
-            if name == "logs":
-                problems += _log_problems(seal.get(name), expected[name])
-            elif name == "sizes":
-                problems += _size_problems(seal.get(name), expected[name])
-            else:
-                problems.append(_SEALED.get(name, name))
-    if not problems and blob != (json.dumps(expected, indent=1, sort_keys=True) + "\n").encode():
-        problems.append(f"{SEAL}: its bytes were edited")
+def _wanted(folder: Path, config: Mapping[str, Any]) -> float:
+    """Optimiser steps of the whole run; infinite where neither manifest nor checkpoint says."""
+    counts = [config.get("max_steps")]
+    with suppress(ValueError, OSError, IndexError, AttributeError):
+        state = run_folder.checkpoints(folder)[-1] / run_folder.TRAINER_STATE
+        counts.append(json.loads(state.read_text(encoding="utf-8")).get("max_steps"))
+    return next((n for n in counts if isinstance(n, int) and n > 0), math.inf)
+
+
+def _check_seal(folder: Path, head: str) -> list[str]:
+    blob, expected = (folder / SEAL).read_bytes(), seal_of(folder).encode()
+    problems = []
+    if blob != expected:
+        sealed: Mapping[str, Any] = {}
+        with suppress(ValueError):
+            sealed = _mapping(_mapping(json.loads(blob)).get("files"))
+        found = json.loads(expected)["files"]
+        for name in sorted({*sealed, *found}):
+            problems += _differences(name, sealed.get(name), found.get(name))
+        problems = problems or [f"{SEAL} was edited"]
     if head and digest(blob) != head:
         problems.append(f"the head of the chain is {digest(blob)}, not {head}: the records are not those of that run")
-    return problems, []
-
-
-_SEALED = {
-    "last_receipt": f"the last record of {UPDATES} is not that of {SEAL} (`last_receipt`): it was edited or deleted",
-    "updates": f"{UPDATES} has not as many records as {SEAL} says (`updates`)",
-    "manifest": f"{MANIFEST} is not the one that {SEAL} names (`manifest`)",
-    "format": f"{SEAL}: `format` was edited",
-}
-
-
-def _size_problems(sealed: Any, found: Mapping[str, int]) -> list[str]:
-    if not isinstance(sealed, Mapping):
-        return [f"{SEAL}: `sizes` was edited"]
-    return [
-        f"{name} has {found.get(name, 0)} bytes, {SEAL} says {sealed.get(name, 0)} (`sizes`)"
-        for name in sorted({*sealed, *found})
-        if sealed.get(name) != found.get(name)
-    ]
-
-
-def _log_problems(sealed: Any, found: Mapping[str, list[str]]) -> list[str]:
-    if not isinstance(sealed, Mapping):
-        return [f"{SEAL}: `logs` was edited"]
-    problems = []
-    for name in sorted({*sealed, *found}):
-        then, now = sealed.get(name) or [], found.get(name) or []
-        if len(then) != len(now):
-            problems.append(f"{name} has {len(now)} records, {SEAL} says {len(then)} (`logs`)")
-        edited = [i for i, (a, b) in enumerate(zip(then, now, strict=False), 1) if a != b]
-        problems += [
-            f"{name}, record {i}: logged metrics edited, or its digest in {SEAL} (`logs`)" for i in edited[:SHOWN]
-        ]
     return problems
+
+
+def _differences(name: str, sealed: Any, found: Any) -> list[str]:
+    """How a file differs from what the seal says of it."""
+    then, now = _mapping(sealed).get("lines"), _mapping(found).get("lines")
+    if sealed == found:
+        return []
+    if not isinstance(then, list) or now is None:
+        return [f"{name} was {'deleted' if now is None else 'added'} after the run's end, or {SEAL} edited"]
+    edited = [i for i, (a, b) in enumerate(zip(then, now, strict=False), 1) if a != b]
+    problems = [f"{name}, record {i}: edited, or its digest in {SEAL}" for i in edited]
+    if len(then) != len(now):
+        problems.append(f"{name} has {len(now)} records, {SEAL} says {len(then)}")
+    return problems or [f"{name} or its digest in {SEAL} was edited; its records read as before"]
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}

@@ -74,6 +74,12 @@ class Credited:
     metrics: dict[str, float]
 
 
+SAME = ("estimator", "gamma", "gigpo_weight", "normalize", "overlong", "skip_zero_variance")
+FIELDS = (*SAME, "num_generations", "overlong_ends", "train_calls", "train_credits", "mask_truncated", "rewards")
+FIELDS += ("write_credit", "write_calls", "write_rerolls", "write_points")
+"""Fields of a configuration that credit depends on; those of `SAME` are called so in the rule too."""
+
+
 @dataclass(frozen=True)
 class CreditRule:
     """How episodes are credited; what is not told here is told of the same field of `trainers.config.ScaffoldConfig`.
@@ -104,23 +110,17 @@ class CreditRule:
         Raises:
             ValueError: the record lacks a field that credit depends on.
         """
-        config = {**OF_OLDER_RUNS, **config}
-        missing = [name for name in FIELDS if name not in config]
-        if missing:
+        if missing := [name for name in FIELDS if name not in config]:
             raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
-        rewards = config["rewards"]
-        same = ("estimator", "gamma", "gigpo_weight", "normalize", "overlong", "skip_zero_variance")
+        given = {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
+        rewards = given["rewards"]
         return cls(
-            group=config["num_generations"],
-            overlong_ends=tuple(config["overlong_ends"]),
-            train=TrainFilter(
-                tuple(config["train_calls"]), tuple(config["train_credits"]), tuple(config["mask_truncated"])
-            ),
+            group=given["num_generations"],
+            overlong_ends=given["overlong_ends"],
+            train=TrainFilter(given["train_calls"], given["train_credits"], given["mask_truncated"]),
             rewards=RewardSet({rewards: 1.0} if isinstance(rewards, str) else rewards).weights,
-            writes=WriteRule(
-                config["write_credit"], tuple(config["write_calls"]), config["write_rerolls"], config["write_points"]
-            ),
-            **{name: config[name] for name in same},
+            writes=WriteRule(*(given[f"write_{name}"] for name in ("credit", "calls", "rerolls", "points"))),
+            **{name: given[name] for name in SAME},
         )
 
     def score(self, trajectories: Sequence[Trajectory]) -> list[ScoredEpisode]:
@@ -151,13 +151,13 @@ class CreditRule:
         if len(outcomes) % self.group:
             raise ValueError(f"{len(outcomes)} episodes are no whole groups of {self.group}")
         spec = estimator(self.estimator)
-        given = {"gamma": self.gamma, "gigpo_weight": self.gigpo_weight}
         result: list[float | list[float] | None] = [None] * len(outcomes)
-        for start in range(0, len(outcomes), self.group):
-            places = [i for i in range(start, start + self.group) if self._counts(outcomes[i])]
+        for group in self._groups(len(outcomes)):
+            places = [i for i in group if self._counts(outcomes[i])]
             rewards = [outcomes[i].rewards or () for i in places]
+            given = {"gamma": self.gamma, "gigpo_weight": self.gigpo_weight}
             needed = given | {"anchors": [outcomes[i].anchors for i in places]}
-            values: Any = rewards if spec.per_step else [_total(r) for r in rewards]
+            values: Any = rewards if spec.per_step else [math.fsum(r) for r in rewards]
             values = spec.function(values, **{name: needed[name] for name in spec.needs})
             for i, value in zip(places, values, strict=True):
                 result[i] = value
@@ -171,20 +171,20 @@ class CreditRule:
             gather: returns of all ranks are needed, and their numbers of trained tokens.
         """
         outcomes: list[Outcome] = gather([self.outcome(e) for e in episodes])
-        advantages = self.advantages(outcomes)
-        writes = self.write_advantages(outcomes)
-        signal = self.signal(advantages, writes)
-        first = rank * len(episodes)
+        advantages, writes = self.advantages(outcomes), self.write_advantages(outcomes)
+        signal = [
+            any(_nonzero(advantages[i]) or any((writes[i] or {}).values()) for i in group)
+            for group in self._groups(len(outcomes))
+        ]
         rows: list[Row] = []
         for i, episode in enumerate(episodes):
-            place = first + i
+            place = rank * len(episodes) + i
             advantage = advantages[place]
             masked = self.overlong == "mask" and outcomes[place].overlong
             skipped = self.skip_zero_variance and not signal[place // self.group]
-            if advantage is None or masked or skipped:
-                continue
-            sequences = build_sequences(episode.trajectory, self.train)
-            rows += [Row(s, self._per_token(s, advantage, writes[place]), i) for s in sequences]
+            if advantage is not None and not masked and not skipped:
+                sequences = build_sequences(episode.trajectory, self.train)
+                rows += [Row(s, self._per_token(s, advantage, writes[place]), i) for s in sequences]
         if self.normalize == "rollout":
             rows = per_rollout(rows, gather)
         metrics = _metrics(outcomes, signal, rows, len(episodes)) | _write_metrics(outcomes, writes)
@@ -192,70 +192,35 @@ class CreditRule:
 
     def write_advantages(self, outcomes: Sequence[Outcome]) -> list[Advantages | None]:
         """Per rollout what its writes earn, by step; `None` where they earn what every other token does."""
-        result: list[Advantages | None] = []
-        for start in range(0, len(outcomes), self.group):
-            members = outcomes[start : start + self.group]
-            group = [Paired(_total(o.rewards or ()) if self._counts(o) else None, o.beside) for o in members]
-            result += self.writes.advantages(group, self._values)
-        return result
-
-    def _values(self, returns: Sequence[float]) -> Sequence[float]:
-        """The run's estimator over one group of returns; `grpo` for those that score steps."""
         spec = estimator(self.estimator)
-        values: Sequence[float] = grpo(returns) if spec.per_step else spec.function(returns)
-        return values
+        values = grpo if spec.per_step else spec.function  # estimators per step score no whole episode
+        paired = [Paired(math.fsum(o.rewards or ()) if self._counts(o) else None, o.beside) for o in outcomes]
+        groups = ([paired[i] for i in group] for group in self._groups(len(outcomes)))
+        return [earned for group in groups for earned in self.writes.advantages(group, values)]
 
-    def signal(
-        self, advantages: Sequence[float | list[float] | None], writes: Sequence[Advantages | None] = ()
-    ) -> list[bool]:
-        """Per group whether anyone has an advantage other than 0, for what it did or for what it wrote."""
-        groups = [slice(start, start + self.group) for start in range(0, len(advantages), self.group)]
-        return [any(map(_nonzero, advantages[g])) or any(any((w or {}).values()) for w in writes[g]) for g in groups]
+    def _groups(self, episodes: int) -> list[range]:
+        return [range(start, start + self.group) for start in range(0, episodes, self.group)]
 
     def _per_token(
         self, sequence: TokenSequence, advantage: float | list[float], writes: Advantages | None
     ) -> Advantage:
         """The episode's number or each trained token's step value; tokens of a write earn what the write does."""
+        earned = writes or {}
         wrote = {c for c, path in sequence.paths.items() if writes is not None and self.writes.is_write(path)}
         if isinstance(advantage, float) and not wrote:
             return advantage
-        values = []
-        for step, call, trained in zip(sequence.steps, sequence.calls, sequence.mask, strict=True):
+
+        def value(step: int, call: int, trained: int) -> float:
             if not trained:
-                values.append(0.0)
-            elif call in wrote:
-                earned = writes or {}
-                values.append(earned.get(step, earned.get(EVERY, 0.0)))
-            else:
-                values.append(advantage if isinstance(advantage, float) else advantage[step])
-        return tuple(values)
+                return 0.0
+            if call in wrote:
+                return earned.get(step, earned.get(EVERY, 0.0))
+            return advantage if isinstance(advantage, float) else advantage[step]
+
+        return tuple(map(value, sequence.steps, sequence.calls, sequence.mask))
 
     def _counts(self, outcome: Outcome) -> bool:
         return outcome.rewards is not None and not (self.overlong == "drop" and outcome.overlong)
-
-
-FIELDS = (
-    "num_generations",
-    "estimator",
-    "gamma",
-    "gigpo_weight",
-    "normalize",
-    "overlong",
-    "overlong_ends",
-    "skip_zero_variance",
-    "train_calls",
-    "train_credits",
-    "mask_truncated",
-    "rewards",
-    "write_credit",
-    "write_calls",
-    "write_rerolls",
-    "write_points",
-)
-"""Fields of a configuration that credit depends on."""
-
-OF_OLDER_RUNS = {"write_credit": "episode", "write_calls": ["memory.*"], "write_rerolls": 2, "write_points": 1}
-"""What was so before there were fields for it."""
 
 
 def is_overlong(trajectory: Trajectory, ends: Sequence[str]) -> bool:
@@ -279,10 +244,6 @@ def per_rollout(rows: Sequence[Row], gather: Gather = list) -> list[Row]:
     return [replace(row, advantage=_times(row.advantage, total / (rollouts * counts[row.episode]))) for row in rows]
 
 
-def _total(rewards: Sequence[float]) -> float:
-    return Score({}, tuple(rewards)).total
-
-
 def _times(advantage: Advantage, factor: float) -> Advantage:
     return advantage * factor if isinstance(advantage, float) else tuple(a * factor for a in advantage)
 
@@ -296,9 +257,9 @@ def _metrics(
 ) -> dict[str, float]:
     per_episode = Counter(row.episode for row in rows)
     return {
-        "groups/zero_variance": 1 - sum(signal) / max(1, len(signal)),
-        "rollouts/unscorable": sum(o.rewards is None for o in outcomes) / max(1, len(outcomes)),
-        "rollouts/overlong": sum(o.overlong for o in outcomes) / max(1, len(outcomes)),
+        "groups/zero_variance": 1 - _share(signal),
+        "rollouts/unscorable": _share([o.rewards is None for o in outcomes]),
+        "rollouts/overlong": _share([o.overlong for o in outcomes]),
         "rollouts/rows_per_episode": len(rows) / max(1, episodes),
         "rollouts/trained_tokens": float(sum(row.sequence.trained for row in rows)),
         "rollouts/multi_row_episodes": sum(n > 1 for n in per_episode.values()) / max(1, episodes),
@@ -313,7 +274,11 @@ def _write_metrics(outcomes: Sequence[Outcome], writes: Sequence[Advantages | No
     earned = [value for w in writes for value in (w or {}).values()]
     return {
         "writes/counterfactuals": float(len(beside)),
-        "writes/failed": sum(r.total is None for r in beside) / max(1, len(beside)),
+        "writes/failed": _share([r.total is None for r in beside]),
         "writes/advantage_mean": math.fsum(earned) / max(1, len(earned)),
-        "writes/with_signal": sum(map(bool, earned)) / max(1, len(earned)),
+        "writes/with_signal": _share([value != 0 for value in earned]),
     }
+
+
+def _share(flags: Sequence[bool]) -> float:
+    return sum(flags) / max(1, len(flags))

@@ -18,9 +18,6 @@ def field_digests(record: Mapping[str, Any]) -> dict[str, str]:
     """Path of a field -> 12 hex digits over all its values in the record.
 
     A mapping at the top has a path for each key; records in a list share theirs, with their places.
-
-    Args:
-        record: JSON data, whole or damaged.
     """
     values: dict[str, list[Any]] = defaultdict(list)
 
@@ -43,9 +40,8 @@ def field_digests(record: Mapping[str, Any]) -> dict[str, str]:
 
 def differing(recorded: Any, found: Mapping[str, str]) -> list[str]:
     """Names whose digests differ, or that only one of the two has."""
-    if not isinstance(recorded, Mapping):
-        return sorted(found)
-    return sorted(name for name in {*recorded, *found} if recorded.get(name) != found.get(name))
+    known = recorded if isinstance(recorded, Mapping) else {}
+    return sorted(name for name in {*known, *found} if known.get(name) != found.get(name))
 
 
 def short_digest(value: Any) -> str:

@@ -12,6 +12,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, zip_longest
 from typing import Any
 
 from agentspec.actions import suggest
@@ -103,24 +104,20 @@ def discounted(rewards: Sequence[float], gamma: float) -> list[float]:
     >>> discounted([1.0, 0.0, 2.0], 0.5)
     [1.5, 1.0, 2.0]
     """
-    togo, running = [0.0] * len(rewards), 0.0
-    for t in range(len(rewards) - 1, -1, -1):
-        running = rewards[t] + gamma * running
-        togo[t] = running
-    return togo
+    return list(accumulate(reversed(rewards), lambda later, reward: reward + gamma * later))[::-1]
 
 
 def reward_to_go(rewards: Rewards, *, gamma: float = 1.0) -> list[list[float]]:
     """Discounted reward-to-go, centred per step over the group and scaled by the group's deviation.
 
     The baseline of step t is the mean over all rollouts; one that has ended earns nothing more, so it counts with 0.
-    The deviation is that of all centred values of the group (sample deviation).
+    The deviation is the sample deviation of the centred values of all steps that were taken, about their own mean: where
+    rollouts end at different times this is not 0.
     """
     togo = [discounted(r, gamma) for r in rewards]
-    longest = max(map(len, togo), default=0)
-    means = [math.fsum(g[t] if t < len(g) else 0.0 for g in togo) / len(togo) for t in range(longest)]
     if len(togo) < 2:
         return [[0.0] * len(g) for g in togo]
+    means = [math.fsum(step) / len(togo) for step in zip_longest(*togo, fillvalue=0.0)]
     return _scaled([[v - m for v, m in zip(g, means, strict=False)] for g in togo])
 
 
@@ -139,7 +136,7 @@ def gigpo(rewards: Rewards, *, anchors: Anchors, gamma: float = 1.0, gigpo_weigh
             raise ValueError(f"rollout {i} has {len(values)} steps and {len(states)} anchor states")
         for t, state in enumerate(states):
             members[state].append((i, t))
-    result = [[base] * len(r) for base, r in zip(grpo([math.fsum(r) for r in rewards]), rewards, strict=True)]
+    result = [[base] * len(r) for base, r in zip(grpo(list(map(math.fsum, rewards))), rewards, strict=True)]
     for places in members.values():
         for (i, t), value in zip(places, grpo([togo[i][t] for i, t in places]), strict=True):
             result[i][t] += gigpo_weight * value
@@ -156,7 +153,7 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
         EstimatorSpec(
             "reward_to_go",
             reward_to_go,
-            "reward-to-go of the step, centred per step over the group, / deviation of the group",
+            "reward-to-go of the step, centred per step over the group, / sample deviation of all these",
             per_step=True,
             zero_sum=False,
             needs=("gamma",),
@@ -187,21 +184,22 @@ def estimator(name: str) -> EstimatorSpec:
 
 def _centred(values: Sequence[float]) -> list[float]:
     """Less their mean; exactly 0 where all are equal up to float noise."""
-    if not values:
-        return []
+    if _deviation(values) <= TOLERANCE:
+        return [0.0] * len(values)
     mean = math.fsum(values) / len(values)
-    result = [v - mean for v in values]
-    return result if _deviation(result) > TOLERANCE else [0.0] * len(result)
+    return [v - mean for v in values]
 
 
 def _scaled(centred: Sequence[Sequence[float]]) -> list[list[float]]:
     """Divided by the sample deviation of all values; exactly 0 where all are equal up to float noise."""
     deviation = _deviation([v for values in centred for v in values])
-    if deviation <= TOLERANCE:
-        return [[0.0] * len(values) for values in centred]
-    return [[v / (deviation + EPSILON) for v in values] for values in centred]
+    divisor = deviation + EPSILON if deviation > TOLERANCE else math.inf
+    return [[v / divisor for v in values] for values in centred]
 
 
-def _deviation(centred: Sequence[float]) -> float:
-    """Sample deviation of values whose mean is 0; 0 for fewer than two."""
-    return math.sqrt(math.fsum(v * v for v in centred) / (len(centred) - 1)) if len(centred) > 1 else 0.0
+def _deviation(values: Sequence[float]) -> float:
+    """Sample deviation; 0 for fewer than two values."""
+    if len(values) < 2:
+        return 0.0
+    mean = math.fsum(values) / len(values)
+    return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))

@@ -115,13 +115,18 @@ ALSO_ALLOWED = {"pad_to_multiple_of": (None,), "do_eval": (True,), "do_train": (
 """What transformers and TRL themselves write into fields that are refused."""
 
 
+def defaults(config: type) -> dict[str, Any]:
+    """Field of a dataclass -> its default."""
+    return {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(config)}
+
+
 def field_rules(config: type) -> dict[str, FieldRule]:
     """The rule of every field in the table, by name.
 
     Args:
         config: the dataclass whose defaults stand in refused fields (`trl.GRPOConfig`).
     """
-    default = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(config)}
+    default = defaults(config)
     rules = {name: FieldRule("used", heading) for heading, names in USED.items() for name in names.split()}
     rules |= {name: FieldRule("fixed", why, allowed) for name, (why, allowed) in FIXED.items()}
     for why, names in REFUSED.items():

@@ -26,12 +26,8 @@ class FiniteGuard(TrainerCallback):
             require_finite("gradient", named, state.global_step)
 
     def on_optimizer_step(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
-        require_finite("weight", trained(kwargs["model"]), state.global_step)
-
-
-def trained(model: nn.Module) -> Iterable[tuple[str, torch.Tensor]]:
-    """Name and value of the parameters under training."""
-    return ((n, p.detach()) for n, p in model.named_parameters() if p.requires_grad)
+        named = ((n, p.detach()) for n, p in kwargs["model"].named_parameters() if p.requires_grad)
+        require_finite("weight", named, state.global_step)
 
 
 def require_finite(what: str, named: Iterable[tuple[str, torch.Tensor]], step: int) -> None:
@@ -45,12 +41,10 @@ def require_finite(what: str, named: Iterable[tuple[str, torch.Tensor]], step: i
     Raises:
         NonFiniteError: which tensor, in which update, and what to look at.
     """
-    tensors = [(n, t.to_local() if hasattr(t, "to_local") else t) for n, t in named]
-    tensors = [(n, t) for n, t in tensors if t.numel()]
-    if not tensors:
-        return
-    finite = torch.stack([t.abs().max().isfinite() for _, t in tensors]).tolist()
-    bad = [n for (n, _), ok in zip(tensors, finite, strict=True) if not ok]
+    local = {n: t.to_local() if hasattr(t, "to_local") else t for n, t in named}
+    tensors = {n: t.abs().max().isfinite() for n, t in local.items() if t.numel()}
+    finite = torch.stack(list(tensors.values())).tolist() if tensors else []  # one look at the device for all
+    bad = [n for n, ok in zip(tensors, finite, strict=True) if not ok]
     if bad:
         raise NonFiniteError(
             f"{what} of update {step} is not finite ({len(bad)} of {len(tensors)}, the first: {bad[0]}); nothing of it "

@@ -19,8 +19,7 @@ from accelerate.utils import gather_object
 from torch import nn
 from trl import GRPOTrainer
 
-from agentspec.carry import FILE as MEMORY_FILE
-from agentspec.carry import MemoryBank, save_bank
+from agentspec.carry import MemoryBank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
@@ -33,15 +32,17 @@ from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import play_beside
 from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, ScoredEpisode
-from trainers.distributed import KnownLayout, check_trained
+from trainers.distributed import KnownLayout, check_trained, is_sharded
 from trainers.finite import FiniteGuard, without_dropout
+from trainers.forward import frozen_output
+from trainers.frozen import FrozenOutput, frozen_layers, layer_above
 from trainers.losses import UpdateSize, loss
 from trainers.micro_batches import PADDED, ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
 from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, local_llm, rollout_jobs
-from trainers.round_metrics import episode_metrics, named, round_metrics
+from trainers.round_metrics import SamplingMetrics, episode_metrics, named, round_metrics
 from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row
@@ -92,6 +93,9 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
                 enable_tree(self.accelerator.unwrap_model(policy))
         self.add_callback(FiniteGuard)
         self._packing: dict[str, Any] = {"packing": args.packing, "tokens_per_forward": args.tokens_per_forward}
+        self._frozen = [] if is_sharded(self.accelerator) else frozen_layers(self.accelerator.unwrap_model(self.model))
+        self._recorder: Any = None  # of their output, while the local backend plays
+        self._below: FrozenOutput | None = None
         self.run_log = RunLog(args.output_dir)
         self._make_env = make_env
         self._make_llm = make_llm or partial(local_llm, batching=args.batching)
@@ -99,7 +103,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         self._round = 0
         self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
-        self._largest_difference: list[torch.Tensor] = []
+        self._sampling_metrics = SamplingMetrics()
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
@@ -129,7 +133,11 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
 
             self._llm = trl_backend(self.vllm_generation, self.processing_class)
         if self._llm is None:
-            self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
+            model = self.accelerator.unwrap_model(self.model)
+            self._llm = self._make_llm(model, self.processing_class)
+            # An update that finds a round half done, after a restart, could not have what the rollouts left.
+            if self._frozen and not self._off_policy and hasattr(self._llm, "record_states"):
+                self._recorder = self._llm.record_states(layer_above(model, self._frozen))
         return self._llm
 
     def _play_round(self, rows: list[dict[str, Any]]) -> list[ScoredEpisode]:
@@ -143,6 +151,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             memory=self._memory,
         )
         with self._current_weights():
+            if self._recorder:
+                self._recorder.clear()
             episodes = self._play(jobs)
             if self.credit_rule.writes.spec.function is None:
                 return episodes
@@ -191,16 +201,13 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
     def _carried_memory(self) -> bytes | None:
         """With `scope: run`: the bank of memories that the next round starts from, the same on every rank.
 
-        Each task carries the memory of one of its own rollouts. The main process keeps the bank as `memory.json`.
+        Each task carries the memory of one of its own rollouts.
         """
         if self.args.spec.scope != "run":
             return None
         bank = MemoryBank.of_spec(self.args.spec) if self._memory is None else MemoryBank.load(self._memory)
         played = [(e.trajectory.task.key, e.total, e.trajectory.memory_state) for e in self._played]
-        bank = bank.carried(gather_object(played), self.args.memory_carry)
-        if self.accelerator.is_main_process:
-            save_bank(self.run_log.folder / MEMORY_FILE, bank)
-        return bank.dump()
+        return bank.carried(gather_object(played), self.args.memory_carry).dump()
 
     # --- updates -----------------------------------------------------------------------------------------------------
 
@@ -208,6 +215,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         """The next micro-batch; a new generation round when the buffered ones are used up."""
         if self._step % self._steps_per_round == 0 or self._buffered_inputs is None:
             self._round = self.state.global_step
+            self._below = None  # not held while episodes are played
             self._played = self._play_round(generation_batch)
             self._memory = self._carried_memory()
             credited = self._credit()
@@ -236,6 +244,10 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
+        recorded = {"recorded": self._recorder.find} if self._recorder else {}
+        with self.accelerator.autocast():
+            policy, all_rows = self.accelerator.unwrap_model(self.model), [r for rows in micro_batches for r in rows]
+            self._below = frozen_output(policy, self._frozen, all_rows, **recorded, **self._packing)
         counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
         padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []
@@ -278,18 +290,14 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             settings=settings(self.args.to_dict()),
         )
         if self.accelerator.is_main_process:
-            self.run_log.receipt(record, files)
+            self.run_log.receipt(record, files, self._memory)
 
     def log(self, logs: dict[str, float], start_time: float | None = None) -> None:
         summary = "train_runtime" in logs  # of a whole (part of a) run, not of an update
         if self.model.training and not summary:
-            logs |= self._call_metrics.flush(gather_object)
-            differences = gather_object([d.item() for d in self._largest_difference])
-            self._largest_difference = []
-            if differences:
-                logs["sampling/logp_difference_max"] = torch.tensor(differences).max().item()
+            logs |= self._call_metrics.flush(gather_object) | self._sampling_metrics.flush(gather_object)
         super().log(logs, start_time)
-        if self.accelerator.is_main_process and not summary:
+        if self.accelerator.is_main_process and not summary and not self.run_log.sealed:
             step, name = self.state.global_step, METRICS if self.model.training else EVALUATIONS
             if not self.model.training:
                 self.run_log.rewind(name, "step", step - 1)  # a resumed run may evaluate its checkpoint again

@@ -8,6 +8,7 @@ in what follows from it.
 from __future__ import annotations
 
 from agentspec.registry import SpecError
+from trainers.checks import own_memory_paths
 from trainers.config import ScaffoldConfig
 
 PATTERN = "memory.*"
@@ -22,13 +23,10 @@ def as_memory(config: ScaffoldConfig) -> ScaffoldConfig:
     Raises:
         SpecError: the agent's memory asks the policy nothing.
     """
-    spec = config.spec
-    helped = {module for pattern in spec.roles for module in spec.helped(pattern)}
-    paths = [p for p in spec.call_paths() if p.startswith("memory.") and p.partition("/")[0] not in helped]
-    if not paths:
+    if not own_memory_paths(config):
         raise SpecError(
-            f"the agent's memory is {spec.memory.name!r}, and the policy is asked nothing for it; choose one that "
-            "writes, `memory: dynamic_cheatsheet` say (`agentspec list memory` shows their calls)"
+            f"the agent's memory is {config.spec.memory.name!r}, and the policy is asked nothing for it; choose one "
+            "that writes, `memory: dynamic_cheatsheet` say (`agentspec list memory` shows their calls)"
         )
     if not any(p.startswith("memory.") for p in config.train_calls):
         config.train_calls = [*config.train_calls, PATTERN]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
+from itertools import groupby
 
 from agentspec.trajectory import Trajectory
 from agentspec.types import Completion, LLMCall
@@ -20,26 +21,19 @@ def check_tokens(sequence: TokenSequence, trajectory: Trajectory) -> tuple[list[
     calls = {c.id: c for c in trajectory.calls}
     problems: list[str] = []
     by_tag: Counter[str] = Counter()
-    for start, end in _runs(sequence):
-        owner, trained = sequence.calls[start], sum(sequence.mask[start:end])
-        if owner < 0:
-            if trained:
-                problems.append(f"{trained} tokens that no call sampled are trained in {trajectory.episode}")
-        elif owner not in calls:
-            problems.append(f"{trajectory.episode} has no call {owner}, which is said to have sampled tokens")
-        else:
+    start = 0
+    for owner, run in groupby(sequence.calls):
+        end = start + len(list(run))
+        trained = sum(sequence.mask[start:end])
+        if owner in calls:
             problems += _check_run(sequence, start, end, calls[owner], trajectory.episode)
             by_tag[calls[owner].tag.path] += trained
+        elif owner >= 0:
+            problems.append(f"{trajectory.episode} has no call {owner}, which is said to have sampled tokens")
+        elif trained:
+            problems.append(f"{trained} tokens that no call sampled are trained in {trajectory.episode}")
+        start = end
     return problems, by_tag
-
-
-def _runs(sequence: TokenSequence) -> Iterator[tuple[int, int]]:
-    """Maximal stretches of one owner."""
-    start = 0
-    for end in range(1, len(sequence) + 1):
-        if end == len(sequence) or sequence.calls[end] != sequence.calls[start]:
-            yield start, end
-            start = end
 
 
 def _check_run(sequence: TokenSequence, start: int, end: int, call: LLMCall, episode: str) -> Iterator[str]:
@@ -51,8 +45,7 @@ def _check_run(sequence: TokenSequence, start: int, end: int, call: LLMCall, epi
         return
     if tuple(sequence.tokens[:start]) != call.prompt_ids:
         yield f"the tokens before position {start} are not the prompt of {where}"
-    forced = [i for i, a in enumerate(matching[0].allowed) if a is not None and len(a) == 1]
-    if any(sequence.mask[start + i] for i in forced):
+    if any(a is not None and len(a) == 1 and sequence.mask[start + i] for i, a in enumerate(matching[0].allowed)):
         yield f"{where} trains tokens that its constraint forced"
 
 
@@ -69,9 +62,7 @@ def check_completion(completion: Completion, where: str) -> Iterator[str]:
     if any(not math.isfinite(p) or p > 1e-5 for p in logprobs):
         yield f"{where} has log-probabilities that are none (above 0, or not finite)"
     for position, choice in enumerate(allowed):
-        if choice is None:
-            continue
-        if ids[position] not in choice:
+        if choice is not None and ids[position] not in choice:
             yield f"{where}: its constraint does not hold token {position}, which was sampled"
-        if len(choice) == 1 and logprobs and abs(logprobs[position]) > 1e-5:
+        if choice is not None and len(choice) == 1 and logprobs and abs(logprobs[position]) > 1e-5:
             yield f"{where}: token {position} was forced, and its log-probability is not 0"

@@ -18,56 +18,41 @@ from trainers.runlog import FORMAT
 from trainers.sequences import Row
 
 LOSS_SETTINGS = (
-    "loss_type",
-    "epsilon",
-    "epsilon_high",
-    "delta",
-    "beta",
-    "reference",
-    "use_bias_correction_kl",
-    "top_entropy_quantile",
-    "max_completion_length",
-    "num_iterations",
-    "steps_per_generation",
-    "gradient_accumulation_steps",
-    "learning_rate",
-    "lr_scheduler_type",
-    "warmup_steps",
-    "max_grad_norm",
-    "seed",
+    "loss_type epsilon epsilon_high delta beta reference use_bias_correction_kl top_entropy_quantile "
+    "max_completion_length num_iterations steps_per_generation gradient_accumulation_steps learning_rate "
+    "lr_scheduler_type warmup_steps max_grad_norm seed"
 )
 """Fields of a configuration that an update depends on beside those of credit."""
 
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """What an update depends on, of a configuration as plain data."""
-    return {name: jsonable(config[name]) for name in (*FIELDS, *LOSS_SETTINGS) if name in config}
+    return {name: jsonable(config[name]) for name in (*FIELDS, *LOSS_SETTINGS.split())}
 
 
 def row_digest(tokens: Sequence[int], mask: Sequence[int], advantage: float | Sequence[float]) -> str:
     """12 hex digits over what a row is and earns: tokens, mask and advantages, these to seven digits."""
-    values = [advantage] if isinstance(advantage, (int, float)) else list(advantage)
-    return short_digest([list(tokens), list(mask), [f"{v:.6e}" for v in values]])
-
-
-def sampling_digest(row: Row) -> str:
-    """12 hex digits over the distributions that a row's tokens were sampled from."""
-    s = row.sequence
-    return short_digest([s.logprobs, s.temperatures, [[p, list(ids)] for p, ids in sorted(s.allowed.items())]])
+    values = [advantage] if isinstance(advantage, (int, float)) else advantage
+    return short_digest([tokens, mask, [f"{v:.6e}" for v in values]])
 
 
 def receipt_rows(rows: Sequence[Row], first: int = 0) -> list[dict[str, Any]]:
-    """What a receipt says of each row; `first` is the place of this rank's first episode among those of all ranks."""
+    """What a receipt says of each row; `sampling` is a digest of the distributions its tokens were sampled from.
+
+    Args:
+        first: place of this rank's first episode among those of all ranks.
+    """
     return [
         {
             "episode": first + r.episode,
-            "tokens": len(r.sequence),
-            "trained": r.sequence.trained,
+            "tokens": len(s),
+            "trained": s.trained,
             "advantage": r.advantage,
-            "digest": row_digest(r.sequence.tokens, r.sequence.mask, r.advantage),
-            "sampling": sampling_digest(r),
+            "digest": row_digest(s.tokens, s.mask, r.advantage),
+            "sampling": short_digest([s.logprobs, s.temperatures, sorted(s.allowed.items())]),
         }
         for r in rows
+        for s in [r.sequence]
     ]
 
 

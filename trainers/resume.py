@@ -12,11 +12,11 @@ from __future__ import annotations
 import base64
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -27,13 +27,9 @@ from agentspec.files import write_atomic
 from agentspec.registry import SpecError
 from trainers.folder_lock import hold
 from trainers.micro_batches import ROWS
+from trainers.mixin import Base
 from trainers.run_folder import STATE, TRAINER_STATE, set_aside
 from trainers.sequences import Row, TokenSequence
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 FORMAT = 2
 
@@ -65,11 +61,6 @@ def save_state(folder: str | Path, state: ScaffoldState, rank: int = 0) -> None:
         "memory": None if state.memory is None else base64.b64encode(state.memory).decode(),
     }
     write_atomic(Path(folder) / _name(rank), json.dumps(data))
-
-
-def unmark(folder: str | Path) -> None:
-    """Declare a checkpoint incomplete: it is about to be written (again)."""
-    (Path(folder) / STATE).unlink(missing_ok=True)
 
 
 def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None:
@@ -123,31 +114,16 @@ def _name(rank: int) -> str:
 
 def _row_to_json(row: Row) -> dict[str, Any]:
     data = asdict(row)
-    data["sequence"]["allowed"] = [[p, list(ids)] for p, ids in row.sequence.allowed.items()]
-    data["sequence"]["paths"] = list(row.sequence.paths.items())  # JSON has no integer keys
+    for name in ("allowed", "paths"):  # JSON has no integer keys
+        data["sequence"][name] = list(data["sequence"][name].items())
     return data
 
 
 def _row_from_json(data: dict[str, Any]) -> Row:
-    fields = dict(data["sequence"])
+    fields = data["sequence"] | {"paths": dict(data["sequence"]["paths"])}
     fields["allowed"] = {p: tuple(ids) for p, ids in fields["allowed"]}
-    fields["paths"] = dict(fields["paths"])
     advantage = data["advantage"]
     return Row(TokenSequence(**fields), tuple(advantage) if isinstance(advantage, list) else advantage, data["episode"])
-
-
-def _step_of(checkpoint: Path) -> int:
-    """Optimiser steps before a checkpoint."""
-    path = checkpoint / TRAINER_STATE
-    if path.is_file():
-        return int(TrainerState.load_from_json(str(path)).global_step)
-    number = checkpoint.name.rpartition("-")[2]
-    return int(number) if number.isdigit() else 0
-
-
-def rows_of(batches: Sequence[dict[str, Any]] | None) -> tuple[tuple[Row, ...], ...]:
-    """The rows of buffered micro-batches."""
-    return tuple(tuple(batch[ROWS]) for batch in batches or ())
 
 
 class ExactResume(Base):
@@ -159,14 +135,14 @@ class ExactResume(Base):
         folder = Path(run) / f"{PREFIX_CHECKPOINT_DIR}-{self.state.global_step}"
         main = self.accelerator.is_main_process
         if main:
-            unmark(folder)
+            (folder / STATE).unlink(missing_ok=True)  # incomplete until it is written (again)
         limit, self.args.save_total_limit = self.args.save_total_limit, None
         try:
             super()._save_checkpoint(model, trial)
         finally:
             self.args.save_total_limit = limit
-        unused = self._step % self._steps_per_round != 0
-        buffered = rows_of(self._buffered_inputs) if unused else ()
+        unused = (self._buffered_inputs or ()) if self._step % self._steps_per_round else ()
+        buffered = tuple(tuple(batch[ROWS]) for batch in unused)
         state = ScaffoldState(self._step, self._round, buffered, self._memory)
         if not main:
             save_state(folder, state, self.accelerator.process_index)
@@ -195,8 +171,9 @@ class ExactResume(Base):
             if not checkpoint or Path(checkpoint).resolve().parent != folder.resolve():
                 set_aside(folder)
             else:
-                self.run_log.unseal()
-                self.run_log.rewind_to(_step_of(Path(checkpoint)))
+                step = TrainerState.load_from_json(str(Path(checkpoint) / TRAINER_STATE)).global_step
+                state = load_state(checkpoint)
+                self.run_log.rewind_to(step, state and state.memory)
             config, spec = self.args.to_dict(), self.args.spec.to_data()
             self.run_log.manifest(config=config, spec=spec, resumed_from=checkpoint)
             self.accelerator.wait_for_everyone()

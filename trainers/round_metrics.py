@@ -84,6 +84,47 @@ def completion_metrics(everyone: Sequence[Played]) -> dict[str, float]:
     return metrics
 
 
+class SamplingMetrics:
+    """How far log-probabilities of the update are from those that sampled, gathered until they are logged.
+
+    `differences` (absolute) and, where vLLM's kernels sampled, `ratios` hold a value per trained token of each
+    micro-batch.
+    """
+
+    def __init__(self) -> None:
+        self.differences: list[torch.Tensor] = []
+        self.ratios: list[torch.Tensor] = []
+
+    def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
+        """`sampling/logp_difference_max`, NaN if any is; with ratios, what TRL logs of vLLM: without NaN, as there."""
+        differences, ratios = self.differences, self.ratios
+        self.differences, self.ratios = [], []
+        metrics = {}
+        if differences:
+            metrics["sampling/logp_difference_max"], trl = _summary(differences, gather)
+            if ratios:
+                metrics |= {f"sampling/sampling_logp_difference/{name}": trl[name] for name in ("mean", "max")}
+        if ratios:
+            found = _summary(ratios, gather)[1]
+            metrics |= {f"sampling/importance_sampling_ratio/{name}": value for name, value in found.items()}
+        return metrics
+
+
+def _summary(
+    values: Sequence[torch.Tensor], gather: Callable[[list[Any]], list[Any]]
+) -> tuple[float, dict[str, float]]:
+    """Over all ranks: the greatest value, NaN if any is; `min`, `mean` and `max` of those that are not (0 of none)."""
+    flat = torch.cat([v.detach().double().cpu() for v in values])
+    known = flat[~flat.isnan()]
+    mine = [flat.numel() - known.numel(), known.numel(), known.sum().item()]
+    mine += [known.min().item(), known.max().item()] if known.numel() else [math.inf, -math.inf]
+    rows = torch.tensor(gather([mine]), dtype=torch.float64)
+    count, total = rows[:, 1].sum().item(), rows[:, 2].sum().item()
+    found = {"min": rows[:, 3].min().item(), "mean": total / max(1, count), "max": rows[:, 4].max().item()}
+    found = found if count else dict.fromkeys(found, 0.0)
+    return (math.nan if rows[:, 0].any() else found["max"]), found
+
+
 def episode_metrics(trajectories: Sequence[Trajectory]) -> dict[str, float]:
     """`episode/NAME`: mean figures of the episodes that did not fail: what `agentspec.metrics.figures` says of each."""
     rows = [figures(t) for t in trajectories if t.scorable]

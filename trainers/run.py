@@ -55,9 +55,8 @@ def train(
     model, tokenizer = load(config)
     trainer = _trainer(trainer_class, config, model, tokenizer, callbacks)
     main = trainer.accelerator.is_main_process
-    for line in (*(f"note: {n}" for n in notes(config)), *([f"resuming from {last}"] if last else [])):
-        if main:
-            print(line, file=sys.stderr)
+    for line in (*(f"note: {n}" for n in notes(config)), *([f"resuming from {last}"] if last else [])) if main else ():
+        print(line, file=sys.stderr)
     with hold(folder) if main else nullcontext():  # until the final model is saved
         try:
             trainer.train(resume_from_checkpoint=str(last) if last else None)

@@ -12,6 +12,7 @@ import os
 import sys
 from pathlib import Path
 
+from agentspec.carry import FILE as MEMORY
 from trainers.folder_lock import LOCK
 
 MANIFEST = "manifest.json"
@@ -32,12 +33,9 @@ def checkpoints(folder: str | Path) -> list[Path]:
     A run that was killed while saving leaves a folder without its last file, or (rotation cut short) without its
     trainer state; both are passed over.
     """
-    found = [
-        (int(number), path)
-        for path in Path(folder).glob(f"{CHECKPOINT}-*")
-        if (number := path.name.rpartition("-")[2]).isdigit()
-    ]
-    return [path for _, path in sorted(found) if (path / STATE).is_file() and (path / TRAINER_STATE).is_file()]
+    found = {path.name.rpartition("-")[2]: path for path in Path(folder).glob(f"{CHECKPOINT}-*")}
+    ordered = [found[number] for number in sorted(filter(str.isdigit, found), key=int)]
+    return [path for path in ordered if (path / STATE).is_file() and (path / TRAINER_STATE).is_file()]
 
 
 def last_complete_checkpoint(folder: str | Path) -> Path | None:

@@ -5,13 +5,14 @@
         manifests/000000.json     those before it: a resumed run has a new one, which names the digest of the one before
         trajectories/000001.jsonl one file per generation round
         updates.jsonl             one receipt per generation round (`trainers.receipts`)
+        memory.json               with `scope: run`: the memories that tasks carry on (`agentspec.carry`)
         metrics.jsonl             what the trainer logged
         evaluations.jsonl         what evaluation while training found (`eval_strategy: steps`)
         seal.json                 written when the run ends: its digest is the head of the chain
 
-A receipt holds the digests of its round's trajectory files, of the manifest and of the receipt before it; the seal
-holds those of the last receipt and of all logged lines, and how many bytes these files have. Whoever keeps the head can
-tell any later edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
+A receipt holds the digests of its round's trajectory files, of the memory after it, of the manifest and of the receipt
+before it; the seal those of all these files, and of each of their lines. Whoever keeps the head can tell any later
+edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from agentspec.files import (
     whole_lines,
     write_atomic,
 )
+from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, versions
 from trainers.digests import field_digests
-from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
 
-FORMAT = 3
-LOGGED = (METRICS, EVALUATIONS)
-"""Files that the seal covers line by line."""
+FORMAT = 4
+SEALED = (MANIFEST, UPDATES, MEMORY, METRICS, EVALUATIONS)
 
 
 class RunLog:
@@ -51,14 +52,8 @@ class RunLog:
 
     def manifest(self, **fields: Any) -> None:
         """Write `manifest.json`: what was run, with which versions and command. One that is there is kept beside it."""
-        previous = self._keep_manifest()
-        data = {
-            "format": FORMAT,
-            "command": sys.argv,
-            "versions": versions(),
-            "previous": previous,
-            **jsonable(fields),
-        }
+        given = {"format": FORMAT, "command": sys.argv, "versions": versions(), "previous": self._keep_manifest()}
+        data = given | jsonable(fields)
         data["digests"] = field_digests(data)
         write_atomic(self.folder / MANIFEST, json.dumps(data, indent=2, sort_keys=True) + "\n")
 
@@ -66,11 +61,11 @@ class RunLog:
         """Put the present manifest among the earlier ones; the digest of the newest of them, empty if there is none."""
         kept = sorted((self.folder / MANIFESTS).glob("*.json"))
         newest = file_digest(kept[-1]) if kept else ""
-        present = self.folder / MANIFEST
-        if present.is_file() and (found := file_digest(present)) != newest:
-            write_atomic(self.folder / MANIFESTS / f"{len(kept):06d}.json", present.read_bytes())
-            return found
-        return newest
+        found = digest_of(self.folder / MANIFEST)
+        if found in ("", newest):
+            return newest
+        write_atomic(self.folder / MANIFESTS / f"{len(kept):06d}.json", (self.folder / MANIFEST).read_bytes())
+        return found
 
     def trajectories(self, round: int, rank: int, episodes: Sequence[Trajectory], kind: str = TRAJECTORIES) -> None:
         """Write this rank's episodes of one generation round into the run's folder `kind`."""
@@ -85,26 +80,44 @@ class RunLog:
         written, self._written = self._written, {}
         return written
 
-    def append(self, name: str, record: Mapping[str, Any]) -> None:
-        """Append one JSON line to `name`. A run that had ended is sealed anew."""
-        append_lines(self.folder / name, record)
-        if (self.folder / SEAL).is_file():
-            self.seal()
+    @property
+    def sealed(self) -> bool:
+        """Whether the run has ended: nothing is added to its records any more."""
+        return (self.folder / SEAL).is_file()
 
-    def receipt(self, record: Mapping[str, Any], files: Mapping[str, Any]) -> None:
-        """Append a receipt, chained to the one before it, the manifest and its round's files (as of `written`)."""
-        chain = {"manifest": manifest_digest(self.folder), "files": dict(files), "previous": last_digest(self.folder)}
-        append_lines(self.folder / UPDATES, {**record, "chain": chain})
+    def append(self, name: str, record: Mapping[str, Any]) -> None:
+        """Append one JSON line to `name`.
+
+        Raises:
+            SpecError: the run has ended.
+        """
+        if self.sealed:
+            raise SpecError(f"{self.folder} is sealed ({SEAL}): its run has ended, and nothing is added to its records")
+        append_lines(self.folder / name, record)
+
+    def receipt(self, record: Mapping[str, Any], files: Mapping[str, Any], memory: bytes | None = None) -> None:
+        """Append a receipt, chained to the one before it, the manifest and its round's files (as of `written`).
+
+        Args:
+            memory: what the next round starts from, kept as `memory.json`; `None`: nothing is carried.
+        """
+        last = last_line(self.folder / UPDATES)
+        chain = {"manifest": digest_of(self.folder / MANIFEST), "files": dict(files)}
+        chain["previous"] = digest(last) if last else ""
+        if memory is not None:
+            chain["memory"] = digest(memory)
+        self.append(UPDATES, {**record, "chain": chain})
+        self._remember(memory)
+
+    def _remember(self, memory: bytes | None) -> None:
+        if memory is not None:
+            write_atomic(self.folder / MEMORY, memory)
 
     def seal(self) -> str:
         """End the chain; returns its head, the digest of the seal."""
-        blob = json.dumps(seal_of(self.folder), indent=1, sort_keys=True) + "\n"
+        blob = seal_of(self.folder)
         write_atomic(self.folder / SEAL, blob)
         return digest(blob)
-
-    def unseal(self) -> None:
-        """The run goes on."""
-        (self.folder / SEAL).unlink(missing_ok=True)
 
     def read(self, name: str) -> list[dict[str, Any]]:
         """All whole records of a JSONL file of this run (none if it does not exist); the file stays as it is.
@@ -122,11 +135,13 @@ class RunLog:
         if len(kept) < len(lines):
             write_atomic(path, b"".join(kept))
 
-    def rewind_to(self, step: int) -> None:
-        """Drop what the run holds beyond checkpoint `step`: the resumed run writes it again."""
+    def rewind_to(self, step: int, memory: bytes | None = None) -> None:
+        """The run goes on from checkpoint `step`, with its `memory`: drop what it holds beyond, and its seal."""
+        (self.folder / SEAL).unlink(missing_ok=True)
         self.rewind(METRICS, "step", step)
         self.rewind(UPDATES, "round", step - 1)
         self.rewind(EVALUATIONS, "step", step)
+        self._remember(memory)
         for path in round_files(self.folder):
             if int(path.name[:6]) >= step:
                 path.unlink()
@@ -137,26 +152,20 @@ def round_files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*/[0-9][0-9][0-9][0-9][0-9][0-9]*.jsonl") if p.is_file())
 
 
-def last_digest(folder: Path) -> str:
-    """Digest of the last receipt's line; empty if there is none."""
-    last = last_line(folder / UPDATES)
-    return digest(last) if last else ""
+def digest_of(path: Path) -> str:
+    """Digest of a file; empty if there is none."""
+    return file_digest(path) if path.is_file() else ""
 
 
-def manifest_digest(folder: Path) -> str:
-    """Digest of the manifest; empty if there is none."""
-    return file_digest(folder / MANIFEST) if (folder / MANIFEST).is_file() else ""
-
-
-def seal_of(folder: Path) -> dict[str, Any]:
-    """What a run's seal must hold."""
-    logs = {name: [digest(line)[:16] for _, line in whole_lines(folder / name)] for name in LOGGED}
-    sizes = {name: (folder / name).stat().st_size for name in (UPDATES, *LOGGED) if (folder / name).is_file()}
-    return {
-        "format": FORMAT,
-        "updates": sum(1 for _ in whole_lines(folder / UPDATES)),
-        "last_receipt": last_digest(folder),
-        "manifest": manifest_digest(folder),
-        "logs": {name: lines for name, lines in logs.items() if lines},
-        "sizes": sizes,
+def seal_of(folder: Path) -> str:
+    """The seal of a folder as it is: of every record its digest and, of a file of lines, 16 digits of each line's."""
+    files = {
+        name: {"digest": file_digest(folder / name), "lines": _lines(folder / name)}
+        for name in SEALED
+        if (folder / name).is_file()
     }
+    return json.dumps({"format": FORMAT, "files": files}, indent=1, sort_keys=True) + "\n"
+
+
+def _lines(path: Path) -> list[str]:
+    return [digest(line)[:16] for _, line in whole_lines(path)] if path.suffix == ".jsonl" else []
