@@ -25,7 +25,7 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import brief, goal_of, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -272,8 +272,7 @@ class MemGPT:
 
     def _recall_search(self, call: FunctionCall) -> str:
         page = max(0, call.page)
-        hits = self._words.search(call.query, 2 * PAGE * (page + 1))
-        hits = distinct(hits, lambda key: self.recall[key].text)
+        hits = self._words.search(call.query, PAGE * (page + 1))
         return self._page([self._named(self.recall[key]) for key, _ in hits], page)
 
     def _page(self, texts: list[str], page: int) -> str:
