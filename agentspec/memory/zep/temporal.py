@@ -58,9 +58,10 @@ class TemporalGraph:
 
     def call(self, id: int, name: str) -> None:
         """Another name of a known entity."""
-        if normal(name) not in self._ids:
-            self._ids[normal(name)] = id
-            self._called[id].append(normal(name))
+        known_as = normal(name)
+        if known_as not in self._ids:
+            self._ids[known_as] = id
+            self._called[id].append(known_as)
             self._written.pop(id, None)
 
     def alike(self, name: str, k: int, least: float) -> list[int]:
@@ -228,9 +229,9 @@ class TemporalGraph:
         self.graph = Graph()
         self.facts.load(facts)
         for id, name, called, _ in entities:
-            self.add_entity(id, name)
-            for other in called:
-                self.call(id, other)
+            self.names[id], self._of[id], self._called[id] = name, {}, called
+            self._numbered.setdefault(_numbers(name), {})[id] = None
+            self._ids |= dict.fromkeys(called, id)
         self.graph.load([[id, [[other, 1.0] for other in near]] for id, _, _, near in entities])
         for fact in self.facts:
             for entity in self._ends(fact):
