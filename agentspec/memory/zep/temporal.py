@@ -8,7 +8,7 @@ what contradicts them, so that the graph can be asked how things stood at any st
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -260,3 +260,12 @@ def holds(fact: Entry, step: int) -> bool:
 
 def _open(fact: Entry) -> bool:
     return fact.data["invalid"] is None
+
+
+def fields_of(state: Mapping[str, Any], subject: str, deep: int = 3) -> Iterator[tuple[str, str, str]]:
+    """The fields of a structured state: whose, which, and their value, where that is short."""
+    for key, value in state.items():
+        if isinstance(value, Mapping) and deep:
+            yield from fields_of(value, str(key), deep - 1)
+        elif isinstance(value, str | int | float | bool) and len(str(value)) <= 60:
+            yield subject, str(key), str(value)
