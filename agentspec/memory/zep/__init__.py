@@ -8,9 +8,10 @@ same things, and is made only where there are such. Code does the rest: what is 
 where the other begins (see `agentspec.memory.zep.temporal`), in whatever order they are told.
 
 Retrieval looks facts up by meaning, by words, and along the graph (`hops`) from what the observation names, fuses the
-three rankings by reciprocal rank (constant 0, as Graphiti does), and shows each with its times. Communities of entities
-are found by label propagation between the episodes of a run, from the labels there are; each that has changed gets a
-summary, and the summary of the community that the observation names most is shown first.
+three rankings by reciprocal rank (constant 0, as Graphiti does), and shows each with its times; what is over is marked
+so, and ranked as everything else. Communities of entities are found by label propagation between the episodes of a run,
+from the labels there are; each that has changed gets a summary, and the summary of the community that the observation
+names most is shown first.
 
 `extraction: state` makes no call at all: facts are the fields of the observation's structured state, and a field that
 changes contradicts its former value; `both` does both. It is for environments whose state is small and symbolic
