@@ -9,8 +9,8 @@ AgentSpec's form: procedural memory of lessons, refined along the trajectory. Ev
 and skills by name (edits are applied by code; what they do not name stays as it is). Skill and log entries are chosen
 by similarity to the observation, without a call; of the log at most a third of what there is to choose from, so that a
 short episode is not shown whole. The workspace is virtual, a mapping of paths to text, and can be written to disk
-(`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of 4,000 tokens of a
-window of 200,000 are shares of the model's window.
+(`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of 4,000 tokens of
+a window of 200,000 are shares of the model's window.
 
 Cost per step: none to retrieve; 1 call per `every` steps; 1 per cut of the conversation; at most 2 at an episode's end,
 and only where a later episode starts from this one's memory. `preset: paper` stands for ReAct + OpenClaw in its tables.
