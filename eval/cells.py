@@ -137,7 +137,11 @@ class Cell:
             yield planned, record, memory
             if record is None:
                 return
-            memory = self.after(store, record, memory)
+            try:
+                memory = self.after(store, record, memory)
+            except ValueError:  # its state is gone: what comes after cannot be found, and playing will say why
+                yield from ((later, None, None) for later in chain[chain.index(planned) + 1 :][:1])
+                return
 
     def after(self, store: Store, record: Record, memory: bytes | None) -> bytes | None:
         """The memory after an episode: a failed one leaves the memory that it started from."""

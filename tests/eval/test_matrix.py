@@ -314,3 +314,25 @@ def test_a_record_may_hold_half_a_surrogate_pair(tmp_path: Path) -> None:
         store.add("k", {"episode": {"status": "failed", "error": "odd: \ud83d"}})
     record = Store(tmp_path).get("k")
     assert record is not None and record["episode"]["error"] == "odd: \ud83d"
+
+
+def test_rows_name_their_trajectories_as_found_from_their_own_folder(tmp_path: Path) -> None:
+    rows, _ = play(tmp_path / "out", policies=[SELLER], trajectories=True, store=tmp_path / "store")
+    assert all((tmp_path / "out" / row["trajectory"]).is_file() for row in rows)
+    assert json.loads((tmp_path / "store/episodes.jsonl").read_text().splitlines()[0])["trajectory"].startswith("traj")
+
+
+def test_a_lost_memory_stops_its_own_cell_and_says_so(tmp_path: Path) -> None:
+    specs = {"run": replace(SCAFFOLDS["memory"], scope="run"), "plain": PLAIN}
+    play(tmp_path, policies=[SELLER], specs=specs)
+    for state in (tmp_path / "states").iterdir():
+        state.unlink()
+    rows, _ = play(tmp_path, policies=[SELLER], specs=specs)
+    assert [r["status"] for r in rows] == ["completed", "unplayed", "unplayed"] + ["completed"] * 3
+    assert "is missing" in rows[1]["error"]
+
+
+def test_one_checkpoint_given_twice_is_not_two_training_runs(tmp_path: Path) -> None:
+    runs = [Policy("trained", model, run=str(i)) for i, model in enumerate(("m", "n", "m"))]
+    with pytest.raises(SpecError, match=r"'trained': two of its training runs \(0, 1, 2\) have the same weights"):
+        play(tmp_path, policies=runs)
