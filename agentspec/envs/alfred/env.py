@@ -63,7 +63,7 @@ class AlfredEnv(Game):
         images: put the egocentric picture into the observation, uint8 (300, 300, 3).
         render_mode: None or "rgb_array".
         player: `offline`, or `ai2thor`: the simulator, version 2.1.0.
-        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/thor.md).
 
     Raises:
         ValueError: an argument that is none of these.

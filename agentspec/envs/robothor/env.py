@@ -90,7 +90,7 @@ class RoboThorEnv(Game):
         images: put the egocentric picture into the observation.
         render_mode: None or "rgb_array".
         player: `offline`, or `ai2thor`: the simulator, version 5.0.0.
-        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/thor.md).
 
     Raises:
         ValueError: an argument that is none of these.
