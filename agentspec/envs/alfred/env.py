@@ -233,6 +233,7 @@ class AlfredEnv(Game):
             },
             "success": self.progress.success,
             "metrics": self._metrics(),
+            "goal_conditions": self.progress.share,
         }
 
     def _listed(self) -> list[dict[str, Any]]:
