@@ -13,50 +13,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
+from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor import homes, mining
-from agentspec.envs.thor.engine import Settings
 from agentspec.envs.thor.game import Game, Told, check
 from agentspec.envs.thor.names import Names, direction, whereabouts, words
 from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Scene
-from agentspec.envs.thor.sight import ROBOT_HEIGHT, Camera
 from agentspec.metrics import Metric
 from agentspec.types import Action, ActionSchema, ActionSpec
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How it is played: the player's settings and the budget."""
-
-    settings: Settings
-    max_steps: int
-
-
-def _preset(turn: float, fov: float, reach: float, steps: int, grid: float = 0.25, size: Any = (300, 300)) -> Preset:
-    camera = Camera(ROBOT_HEIGHT, fov, size[0] / size[1])
-    settings = Settings(
-        grid=grid,
-        rotate_step=turn,
-        horizon=(-30.0, 60.0),
-        visibility=reach,
-        width=size[0],
-        height=size[1],
-        camera=camera,
-        slack=reach,
-    )
-    return Preset(settings, steps)
-
-
-PRESETS: dict[str, Preset] = {
-    "paper": _preset(90.0, 90.0, 1.5, 200),
-    "challenge2021": _preset(30.0, 63.453, 1.0, 500, size=(640, 480)),
-    "casestudy": _preset(45.0, 90.0, 1.5, 200, grid=0.5),
-}
 
 CALLS = {
     "MOVE_AHEAD": ("MoveAhead", "move ahead", "moved ahead"),
@@ -276,8 +244,8 @@ class RoboThorEnv(Game):
             "success": self.won,
             "metrics": self._metrics(),
             "geodesic": {
-                "start": self.left_to_go.get(cell_at(self.episode.x, self.episode.z)),
-                "left": self._distance(),
+                "start": self.far,
+                "left": self.left_to_go,
                 "walked": self.walked,
                 "shortest": self.episode.length,
             },
