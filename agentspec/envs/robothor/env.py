@@ -53,7 +53,7 @@ class RoboThorEnv(Game):
         objects: folder with recorded object metadata; default: `objects` two folders above `data`.
         action_mode: `native` calls, or a `menu` of six phrases.
         reward: `success` (1 for it) or `progress` (besides, metres come nearer to the target over the shortest path's
-            length, clipped to -1..1).
+            length, clipped by the metres moved).
         max_steps: instead of the preset's.
         images: put the egocentric picture into the observation.
         render_mode: None or "rgb_array".
@@ -153,7 +153,7 @@ class RoboThorEnv(Game):
         if not self.event.success:
             raise ValueError(f"episode {e.id} does not fit scene {e.scene}: {self.event.error}")
         self.walked, self.won = 0.0, False
-        self.far = self.near = self.left_to_go = self.world.distance(e.target)
+        self.far = self.level = self.left_to_go = self.world.distance(e.target)
         self.names = Names()
         self.names.add(self.event.metadata["objects"])
 
@@ -165,7 +165,10 @@ class RoboThorEnv(Game):
         at = self.event.metadata["agent"]["position"]
         event = self.act({"action": CALLS[call][0]})
         now = event.metadata["agent"]["position"]
-        self.walked += math.hypot(now["x"] - at["x"], now["z"] - at["z"])
+        moved = math.hypot(now["x"] - at["x"], now["z"] - at["z"])
+        self.walked += moved
+        if self.level is not None and self.left_to_go is not None:
+            self.level -= max(-moved, min(moved, self.level - self.left_to_go))
         if call == "STOP":
             self.stopped, self.won = True, self._in_view()
         # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
@@ -176,7 +179,6 @@ class RoboThorEnv(Game):
         self.event = super().act(action)
         if str(action["action"]).startswith("Move"):
             self.left_to_go = self.world.distance(self.episode.target)
-            self.near = self.near if self.left_to_go is None else self.left_to_go
         return self.event
 
     def _in_view(self) -> bool:
@@ -187,13 +189,14 @@ class RoboThorEnv(Game):
         return float(self.won) + (self._nearer() if self._reward == "progress" else 0.0)
 
     def _nearer(self) -> float:
-        """Metres come nearer since the start over the shortest path's length (at least 1 m), within -1..1.
+        """Metres come nearer since the start over the shortest path's length (at least 1 m).
 
-        It depends on where the agent is, not on how it got there, so that no loop earns anything.
+        `level`, the metres that are paid for, follows the distance by no more than a step moves. So no loop earns
+        anything, whatever the distance jumps.
         """
-        if self.far is None or self.near is None:
+        if self.far is None or self.level is None:
             return 0.0
-        return max(-1.0, min(1.0, (self.far - self.near) / max(self.episode.length, 1.0)))
+        return (self.far - self.level) / max(self.episode.length, 1.0)
 
     # -- reporting ---------------------------------------------------------------------------------------------
 
@@ -267,10 +270,10 @@ class RoboThorEnv(Game):
     # -- exact state -------------------------------------------------------------------------------------------
 
     def _records(self) -> dict[str, Any]:
-        return {"walked": self.walked, "won": self.won, "near": self.near}
+        return {"walked": self.walked, "won": self.won, "level": self.level}
 
     def _recall(self, records: Mapping[str, Any]) -> None:
-        self.walked, self.won, self.near = records["walked"], records["won"], records["near"]
+        self.walked, self.won, self.level = records["walked"], records["won"], records["level"]
         self.event, self.left_to_go = self.world.observe(), self.world.distance(self.episode.target)
 
 
