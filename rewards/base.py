@@ -111,7 +111,9 @@ class RewardSet:
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
         self.weights = {"earning_delta": 1.0} if weights is None else dict(weights)
         if not self.weights:
-            raise SpecError("rewards is {}, which pays nothing; name one (`rewards: {earning_delta: 1.0}`), or leave it out")
+            raise SpecError(
+                "rewards is {}, which pays nothing; name one (`rewards: {earning_delta: 1.0}`), or leave it out"
+            )
         for name, weight in self.weights.items():
             if not math.isfinite(weight):
                 raise SpecError(f"reward {name!r} has weight {weight}; expected a finite number")

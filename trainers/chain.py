@@ -14,12 +14,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from agentspec.carry import FILE as MEMORY
 from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers import run_folder
 from trainers.digests import differing, field_digests
-from trainers.run_folder import MANIFEST, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.run_folder import MANIFEST, METRICS, SEAL, TRAJECTORIES, UPDATES
 from trainers.runlog import FORMAT, digest_of, round_files, seal_of
 
 

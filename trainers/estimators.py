@@ -111,8 +111,8 @@ def reward_to_go(rewards: Rewards, *, gamma: float = 1.0) -> list[list[float]]:
     """Discounted reward-to-go, centred per step over the group and scaled by the group's deviation.
 
     The baseline of step t is the mean over all rollouts; one that has ended earns nothing more, so it counts with 0.
-    The deviation is the sample deviation of the centred values of all steps that were taken, about their own mean: where
-    rollouts end at different times this is not 0.
+    The deviation is the sample deviation of the centred values of all steps that were taken, about their own mean (not 0
+    where rollouts end at different times).
     """
     togo = [discounted(r, gamma) for r in rewards]
     if len(togo) < 2:

@@ -25,8 +25,8 @@ def as_memory(config: ScaffoldConfig) -> ScaffoldConfig:
     """
     if not own_memory_paths(config):
         raise SpecError(
-            f"the agent's memory is {config.spec.memory.name!r}, and the policy is asked nothing for it; choose one that "
-            "writes, `memory: dynamic_cheatsheet` say (`agentspec list memory` shows their calls)"
+            f"the agent's memory is {config.spec.memory.name!r}, and the policy is asked nothing for it; choose one "
+            "that writes, `memory: dynamic_cheatsheet` say (`agentspec list memory` shows their calls)"
         )
     if not any(p.startswith("memory.") for p in config.train_calls):
         config.train_calls = [*config.train_calls, PATTERN]

@@ -16,7 +16,7 @@ from trl.trainer.utils import nanstd
 
 from agentspec.metrics import figures
 from agentspec.trajectory import Trajectory
-from trainers.credit import ScoredEpisode
+from trainers.credit import Gather, ScoredEpisode
 from trainers.sequences import TrainFilter, trained_completions
 
 
@@ -43,7 +43,7 @@ def round_metrics(
     weights: Mapping[str, float],
     *,
     group: int,
-    gather: Callable[[list[Any]], list[Any]] = list,
+    gather: Gather = list,
 ) -> dict[str, float]:
     """Reward and completion figures of a round.
 
@@ -95,7 +95,7 @@ class SamplingMetrics:
         self.differences: list[torch.Tensor] = []
         self.ratios: list[torch.Tensor] = []
 
-    def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
+    def flush(self, gather: Gather = list) -> dict[str, float]:
         """`sampling/logp_difference_max`, NaN if any is; with ratios, what TRL logs of vLLM: without NaN, as there."""
         differences, ratios = self.differences, self.ratios
         self.differences, self.ratios = [], []
@@ -110,7 +110,7 @@ class SamplingMetrics:
         return metrics
 
 
-def _summary(values: Sequence[torch.Tensor], gather: Callable[[list[Any]], list[Any]]) -> tuple[float, dict[str, float]]:
+def _summary(values: Sequence[torch.Tensor], gather: Gather) -> tuple[float, dict[str, float]]:
     """Over all ranks: the greatest value, NaN if any is; `min`, `mean` and `max` of those that are not (0 of none)."""
     flat = torch.cat([v.detach().double().cpu() for v in values])
     known = flat[~flat.isnan()]

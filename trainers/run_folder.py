@@ -12,7 +12,6 @@ import os
 import sys
 from pathlib import Path
 
-from agentspec.carry import FILE as MEMORY
 from trainers.folder_lock import LOCK
 
 MANIFEST = "manifest.json"

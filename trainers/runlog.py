@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from agentspec.carry import FILE as MEMORY
 from agentspec.files import (
     append_lines,
     digest,
@@ -37,7 +38,7 @@ from agentspec.files import (
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, versions
 from trainers.digests import field_digests
-from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
 
 FORMAT = 4
 SEALED = (MANIFEST, UPDATES, MEMORY, METRICS, EVALUATIONS)
