@@ -2,11 +2,11 @@
 
     python -m benchmarks.tamper [--json]
 
-A tiny honest run is made (a random model, groups of two, a memory that asks the model, menus, evaluation while
-training). Then, on a copy each time, one thing is changed and the audit is run: each of the kinds of
-`benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, the carried memories, one line
-of metrics and one of evaluations. Honest runs of every estimator, and of other settings that change what an update is made of, must have
-no violation at all.
+A tiny honest run is made (a random model, groups of two, a memory that asks the model and is carried over episodes,
+menus, evaluation while training). Then, on a copy each time, one thing is changed and the audit is run: each of the
+kinds of `benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, the memories that
+are carried, one line of metrics and one of evaluations. Honest runs of every estimator, and of other settings that
+change what an update is made of, must have no violation at all.
 
 Files that are only shown to people or can be computed again (plots, evaluation tables, the weights, what the terminal
 saw) are no records and are not covered: `excepted` names them. Times are recorded, and covered like everything else.

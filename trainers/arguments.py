@@ -64,12 +64,9 @@ def parse_config(argv: Sequence[str] | None = None, *, default: str | Path) -> S
     except ValueError as error:
         raise SpecError(f"{known.config}, with the command line: {error}") from error
     if unread:
-        raise SpecError(f"unknown option {unread[0]!r}{suggest(unread[0], _options(parser))}")
+        options = [o for action in parser._actions for o in action.option_strings if "-" not in o[2:]]
+        raise SpecError(f"unknown option {unread[0]!r}{suggest(unread[0], options)}")
     return config
-
-
-def _options(parser: argparse.ArgumentParser) -> list[str]:
-    return [option for action in parser._actions for option in action.option_strings if "-" not in option[2:]]
 
 
 def read_config(path: str | Path) -> dict[str, Any]:

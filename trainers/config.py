@@ -1,14 +1,12 @@
 """The configuration of a run: TRL's `GRPOConfig` plus what the scaffold adds, in one dataclass.
 
 `trainers.arguments` fills it from a YAML file and from the command line, and its docstring is what `--help` says of
-each field; no other class mirrors it. What cannot work
-or would not be exact is refused at start, with the reason and the remedy (`trainers.checks`).
+each field. What cannot work or would not be exact is refused at start (`trainers.checks`).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -142,7 +140,10 @@ class ScaffoldConfig(GRPOConfig):
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
             value = getattr(self, name)
             if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
-                setattr(self, name, _json(name, value))
+                try:
+                    setattr(self, name, json.loads(value))
+                except ValueError as error:
+                    raise SpecError(f'{name}: not valid JSON ({error}); quote keys and strings with "') from error
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -221,20 +222,8 @@ class ScaffoldConfig(GRPOConfig):
 
 def agent_spec(value: Any) -> AgentSpec:
     """A spec from a mapping, a YAML path, or nothing (all defaults)."""
-    if value is None:
-        return AgentSpec()
-    if isinstance(value, str):
-        return AgentSpec.from_yaml(value)
-    return AgentSpec.from_data(value)
+    return AgentSpec.from_yaml(value) if isinstance(value, str) else AgentSpec.from_data({} if value is None else value)
 
 
 def _listed(specs: list[Any] | str) -> list[Any]:
     return [specs] if isinstance(specs, str) else list(specs)
-
-
-def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:
-    try:
-        data: Mapping[str, Any] | list[Any] = json.loads(text)
-    except ValueError as error:
-        raise SpecError(f"{name}: not valid JSON ({error}); quote keys and strings with double quotes") from error
-    return data

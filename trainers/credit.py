@@ -1,13 +1,11 @@
 """Credit: from the scored episodes of an update to rows with advantages.
 
-A `CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
-gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
-scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
-became changes nobody's baseline, and all of them share its advantage.
+A `CreditRule` is everything that credit depends on: a run's configuration gives it to the trainer, the run's manifest
+to whoever checks the run. It looks at whole episodes: one that could not be scored counts in no baseline and has no
+rows; an overlong one is masked, kept or dropped; all sequences of an episode share its advantage.
 
-A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
-made after the last step earns nothing in its episode and has no row (`trainers.sequences`). What memory writes may
-be credited by estimators of its own, from episodes played beside the batch (`trainers.writes`).
+A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). What
+memory writes may be credited by estimators of its own, from episodes played beside the batch (`trainers.writes`).
 """
 
 from __future__ import annotations
@@ -53,11 +51,8 @@ class ScoredEpisode:
 class Outcome:
     """What every rank must know of an episode before groups can be formed.
 
-    Args:
-        rewards: per step; `None` if the episode could not be scored.
-        anchors: per step the state its action was taken in, if the estimator needs it.
-        overlong: whether it ended for one of the reasons that make it overlong.
-        beside: what its counterfactuals earned.
+    `rewards` are per step, `None` if it could not be scored; `anchors` the states that actions were taken in, where
+    the estimator needs them; `beside` is what its counterfactuals earned.
     """
 
     rewards: tuple[float, ...] | None

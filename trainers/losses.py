@@ -1,9 +1,7 @@
 """Losses: the objective of a token and what the sum is divided by. One function and one row of `LOSSES` adds one.
 
-TRL's losses are TRL's code: such a row names the `loss_type` that computes it. A row of ours brings an `objective`.
-Either way the row says what divides the sum over an update (`UpdateSize`), which tokens it clips, which settings
-it reads and how, if at all, it depends on the way episodes split into rows; the trainer, the configuration check, the
-clip shares, the audit and the table in the docs follow from it.
+TRL's losses are TRL's code: such a row names the `loss_type` that computes it; a row of ours brings an `objective`. The
+trainer, the configuration check, the clip shares, the audit and the table in the docs follow from the row.
 """
 
 from __future__ import annotations
@@ -67,8 +65,7 @@ def probability_moved(logps: Tensor, old: Tensor, advantages: Tensor, *, low: fl
 def dppo(logps: Tensor, old: Tensor, advantages: Tensor, *, low: float, high: float) -> Tensor:
     """Divergence PPO with the binary total variation (arXiv 2602.04879): `-ratio A`, 0 outside the trust region.
 
-    A ratio is a poor measure of how far a rare token moved: from 0.001 to 0.002 it doubles. Here `epsilon` and
-    `epsilon_high` bound the change of the probability itself.
+    `epsilon` and `epsilon_high` bound the change of the probability itself: a rare token's ratio says little of it.
     """
     outside = probability_moved(logps.detach(), old, advantages, low=low, high=high)
     return (-(logps - old).exp() * advantages).masked_fill(outside, 0.0)

@@ -430,7 +430,7 @@ def test_a_receipt_of_another_version_is_told(copy: Path) -> None:
     edit(copy / "updates.jsonl", lambda r: [record.pop("chain") and record.pop("format") for record in r] and None)
     assert any("updates.jsonl, update 1: format is missing" in v for v in violations(copy))
     edit(copy / "manifest.json", lambda r: r[0].update(format=3))
-    with pytest.raises(SpecError, match="manifest.json has format 3, expected 4; audit it with the version that wrote"):
+    with pytest.raises(SpecError, match="format 3, expected 4; audit it with the version that wrote it"):
         list(audit(copy))
 
 

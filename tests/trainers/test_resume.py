@@ -23,6 +23,7 @@ from tests.toy_env import TOY
 from tests.trainers.builders import CPU_RUN, call, episode
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
+from trainers.folder_lock import LOCK
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import ScaffoldState, load_state, save_state
 from trainers.rollouts import task_rows
@@ -125,11 +126,11 @@ def test_a_finished_run_takes_no_step_more(tmp_path: Path) -> None:
 
 
 def _files(folder: Path) -> dict[str, bytes]:
-    """Every file below a run's folder."""
+    """Every file below a run's folder but its lock."""
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in sorted(folder.rglob("*"))
-        if p.is_file() and "earlier" not in p.relative_to(folder).parts
+        if p.is_file() and p.name != LOCK and "earlier" not in p.relative_to(folder).parts
     }
 
 
