@@ -75,7 +75,7 @@ def rloo(returns: Returns) -> list[float]:
 
 
 def max_rl(returns: Returns) -> list[float]:
-    """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710): a task rarely solved counts 1 / p.
+    """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710): rare success counts 1 / p.
 
     >>> max_rl([1.0, 0.0, 0.0, 0.0])
     [3.0, -1.0, -1.0, -1.0]

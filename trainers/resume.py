@@ -23,9 +23,8 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from trainers.folder_lock import hold
 from trainers.micro_batches import ROWS
-from trainers.run_folder import STATE, TRAINER_STATE, set_aside
+from trainers.run_folder import STATE, TRAINER_STATE, hold, set_aside
 from trainers.sequences import Row, TokenSequence
 
 if TYPE_CHECKING:

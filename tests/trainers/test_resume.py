@@ -23,11 +23,10 @@ from tests.toy_env import TOY
 from tests.trainers.builders import CPU_RUN, call, episode
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
-from trainers.folder_lock import LOCK
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import ScaffoldState, load_state, save_state
 from trainers.rollouts import task_rows
-from trainers.run_folder import checkpoints, last_complete_checkpoint
+from trainers.run_folder import LOCK, checkpoints, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 

@@ -12,13 +12,12 @@ from typing import Any
 import pytest
 
 from agentspec.registry import SpecError
-from trainers import folder_lock
-from trainers.folder_lock import LOCK, hold
-from trainers.run_folder import checkpoints, holds_run, last_complete_checkpoint, set_aside
+from trainers import run_folder
+from trainers.run_folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
 
 HOLDER = """
 import sys
-from trainers.folder_lock import hold
+from trainers.run_folder import hold
 with hold(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -82,7 +81,7 @@ def test_where_nothing_can_be_locked_a_run_goes_on_and_says_so(
     def refuse(*_: Any) -> None:
         raise OSError(38, "Function not implemented")
 
-    for change in ((folder_lock, "fcntl", None), (folder_lock.fcntl, "flock", refuse)):
+    for change in ((run_folder, "fcntl", None), (run_folder.fcntl, "flock", refuse)):
         with monkeypatch.context() as patched:
             patched.setattr(*change)
             with hold(tmp_path):
