@@ -70,8 +70,9 @@ class Credited:
 
 
 SAME = ("estimator", "gamma", "gigpo_weight", "normalize", "overlong", "skip_zero_variance")
-FIELDS = (*SAME, "num_generations", "overlong_ends", "train_calls", "train_credits", "mask_truncated", "rewards")
-FIELDS += ("write_credit", "write_calls", "write_rerolls", "write_points")
+WRITE_FIELDS = ("write_credit", "write_calls", "write_rerolls", "write_points")
+TRAINED_FIELDS = ("train_calls", "train_credits", "mask_truncated")
+FIELDS = (*SAME, "num_generations", "overlong_ends", "rewards", *TRAINED_FIELDS, *WRITE_FIELDS)
 """Fields of a configuration that credit depends on; those of `SAME` are called so in the rule too."""
 
 
@@ -107,14 +108,14 @@ class CreditRule:
         """
         if missing := [name for name in FIELDS if name not in config]:
             raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
-        given = {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
+        given: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in config.items()}
         rewards = given["rewards"]
         return cls(
             group=given["num_generations"],
             overlong_ends=given["overlong_ends"],
-            train=TrainFilter(given["train_calls"], given["train_credits"], given["mask_truncated"]),
+            train=TrainFilter(*(given[name] for name in TRAINED_FIELDS)),
             rewards=RewardSet({rewards: 1.0} if isinstance(rewards, str) else rewards).weights,
-            writes=WriteRule(*(given[f"write_{name}"] for name in ("credit", "calls", "rerolls", "points"))),
+            writes=WriteRule(*(given[name] for name in WRITE_FIELDS)),
             **{name: given[name] for name in SAME},
         )
 

@@ -426,10 +426,10 @@ def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path, capsys: pytest.Ca
     assert "its manifest.json was removed" in refused(str(copy))
 
 
-def test_a_receipt_of_another_version_is_told(copy: Path) -> None:
-    edit(copy / "updates.jsonl", lambda r: [record.pop("chain") and record.pop("format") for record in r] and None)
+def test_records_of_another_version_are_told(copy: Path) -> None:
+    edit(copy / "updates.jsonl", lambda records: [record.pop("format") for record in records] and None)
     assert any("updates.jsonl, update 1: format is missing" in v for v in violations(copy))
-    edit(copy / "manifest.json", lambda r: r[0].update(format=3))
+    edit(copy / "manifest.json", lambda records: records[0].update(format=3))
     with pytest.raises(SpecError, match="format 3, expected 4; audit it with the version that wrote it"):
         list(audit(copy))
 
