@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import difflib
 import functools
+import itertools
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -26,6 +27,7 @@ MAX_LENGTH = 4000
 _QUOTED = re.compile(r"(\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^'\\])*')", re.DOTALL)
 _COLON = re.compile(r"(^|[(,]\s*)([A-Za-z_]\w*)\s*:\s*")
 _OPENING, _CLOSING = {"(": ")", "[": "]", "{": "}"}, frozenset(")]}")
+_NUMBERS = ("int", "float")
 _WORDS = {"true": True, "false": False, "none": None, "null": None}
 
 
@@ -108,7 +110,7 @@ def parse_call(call: Call, schema: ActionSchema) -> Action | ActionError:
         problem = f"there is no action {call.name.upper()}{suggest(call.name, schema.actions)}"
         return ActionError("PARSE_UNKNOWN", problem, call.text[:200])
     try:
-        args, kwargs = _arguments(call.arguments, schema)
+        args, kwargs = _fitted(*_arguments(call.arguments, schema), name, schema)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
         example = schema.actions[name].example or name
         reason = error.msg if isinstance(error, SyntaxError) else error
@@ -150,6 +152,53 @@ def _arguments(text: str, schema: ActionSchema) -> tuple[tuple[Any, ...], dict[s
             raise ValueError("** is not allowed")
         kwargs[keyword.arg] = literal(keyword.value)
     return args, kwargs
+
+
+def _fitted(
+    args: tuple[Any, ...], kwargs: dict[str, Any], name: str, schema: ActionSchema
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments, with a point given as one value taken apart where the action takes its numbers one by one:
+    `MOVE((3, 4))`, `MOVE(to=[3, 4])`, `MOVE({"x": 3, "y": 4})`.
+
+    Raises:
+        ValueError: a list or an object stands where a number or a word must, or a number of a point is missing.
+    """
+    parameters = schema.actions[name].parameters
+    point = list(itertools.takewhile(lambda p: parameters[p].required and parameters[p].type in _NUMBERS, parameters))
+    if len(point) > 1:
+        args, kwargs = _taken_apart(args, kwargs, point, parameters, schema)
+        missing = [p for p in point[len(args) :] if p not in kwargs]
+        if missing:
+            raise ValueError(f"it needs {' and '.join(missing)}")
+    single = {p for p, known in parameters.items() if known.type in _NUMBERS or known.enum}
+    names = itertools.chain(parameters, itertools.repeat(""))
+    return (
+        tuple(_alone(value, p) if p in single else value for value, p in zip(args, names, strict=False)),
+        {p: _alone(value, p) if p in single else value for p, value in kwargs.items()},
+    )
+
+
+def _taken_apart(
+    args: tuple[Any, ...], kwargs: dict[str, Any], point: list[str], known: Mapping[str, Any], schema: ActionSchema
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """A point in the first argument, or in the only one of a name that the action does not know, as its numbers."""
+    loose = [key for key, value in kwargs.items() if key not in known and isinstance(value, list | dict)]
+    given = args[0] if args else kwargs[loose[0]] if len(loose) == 1 else None
+    if isinstance(given, dict):
+        given = [{str(key).casefold(): value for key, value in given.items()}.get(p) for p in point]
+    if not isinstance(given, list) or len(given) != len(point) or None in given or set(point) & set(kwargs):
+        return args, kwargs
+    numbers = [float(_apply_units(v.strip(), schema)) if isinstance(v, str) else v for v in given]
+    return (*numbers, *args[1:]), kwargs if args else {k: v for k, v in kwargs.items() if k != loose[0]}
+
+
+def _alone(value: Any, name: str) -> Any:
+    """A list of one value as that value."""
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, list | dict):
+        raise ValueError(f"{name} must be one value, not {str(value)[:40]}")
+    return value
 
 
 def _apply_units(text: str, schema: ActionSchema) -> str:

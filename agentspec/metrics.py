@@ -72,7 +72,7 @@ PLAIN = {metric.name: metric for metric in (SUCCESS, *SCAFFOLD)}
 CUT_SHORT = ("budget", "context")
 """Ends of an episode that the scaffold brought about, not the environment: counted beside the means."""
 
-_ROW = frozenset({"seed", "rollout", "input_tokens", "output_tokens", "thinking_s"})
+_ROW = frozenset({"seed", "rollout", "input_tokens", "output_tokens", "thinking_s", "wall_s"})
 """Numbers of a row that are no metrics."""
 
 _COUNTED = ("invalid_actions", "llm_calls", "cached_tokens", "input_tokens", "output_tokens", "thinking_s", "ended")

@@ -6,6 +6,7 @@ reasoning, and modules that would call a model are switched off, since there is 
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,15 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.actions import suggest
+from agentspec.files import file_digest
 from agentspec.llm.base import LLM
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec, ModuleSpec
 
 SCRIPTED = ("rule_based", "random")
 """Reasoning modules that are policies of their own."""
-
-EDGE = 1 << 20
-"""Bytes at either end of a weight file that count for its digest."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +32,14 @@ class Policy:
         model: folder, bundled name or hub id; empty: ``name`` is the model.
         adapter: PEFT folder on top of the model, or empty.
         backend: further settings of the backend (``backend``, ``base_url``, ``dtype``, ...); default: the local one.
+        run: which training run of a recipe this is, where several runs are one policy of a table.
     """
 
     name: str
     model: str = ""
     adapter: str = ""
     backend: Mapping[str, Any] = field(default_factory=dict)
+    run: str = ""
 
     @classmethod
     def parse(cls, text: str, **settings: Any) -> Policy:
@@ -109,11 +110,19 @@ class Policy:
         return llm
 
     def identity(self) -> dict[str, Any]:
-        """What makes two policies the same: settings, and a digest of weights that lie in a folder."""
+        """What makes two policies the same: the backend's settings, and weights by their content, wherever they lie."""
         if self.scripted:
             return {"scripted": self.scripted}
-        folders = [Path(p) for p in (self.model or self.name, self.adapter) if p]
-        return self.settings() | {"weights": [weights_digest(f) for f in folders if f.is_dir()]}
+        return weighed(self.settings())
+
+
+def weighed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a backend with every folder of weights replaced by its digest."""
+    found = dict(settings)
+    for name in ("model", "adapter"):
+        if isinstance(found.get(name), str) and Path(found[name]).is_dir():
+            found[name] = f"weights:{weights_digest(Path(found[name]))}"
+    return found
 
 
 def calls_model(kind: str, name: str) -> bool:
@@ -128,16 +137,20 @@ def needs_model(spec: AgentSpec) -> bool:
 
 
 def weights_digest(folder: Path) -> str:
-    """16 hex digits over names, sizes and both ends of a folder's safetensors files.
+    """16 hex digits over the names and bytes of a folder's safetensors files and configurations.
 
-    Training changes every tensor, so the ends tell retrained weights from old ones without reading gigabytes.
+    Files are read whole, once per process while their size and time of change stay.
     """
-    digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.safetensors")):
-        size = path.stat().st_size
-        digest.update(f"{path.name}:{size}:".encode())
-        with open(path, "rb") as file:
-            digest.update(file.read(EDGE))
-            file.seek(max(0, size - EDGE))
-            digest.update(file.read(EDGE))
-    return digest.hexdigest()[:16]
+    files = sorted([*folder.glob("*.safetensors"), *folder.glob("*config.json")])
+    parts = [f"{path.name}:{_file_digest(path, *_stamp(path))}" for path in files]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+@functools.cache
+def _file_digest(path: Path, size: int, changed_ns: int) -> str:
+    return file_digest(path)

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 from agentspec import literals, shapes
 from agentspec.literals import known_name, scan_call
+from agentspec.remarks import is_meant
 from agentspec.types import Action, ActionError, ActionSchema
 from agentspec.values import CALL, DRESS, MOST_CALLS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, squeeze
 from agentspec.visible import undressed, visible
@@ -205,13 +206,14 @@ class _Reader:
                 whole = scan_call(text, match)
                 if isinstance(action, Action) and whole is not None:
                     found.append((action, match.start(), whole.end))
-        if not found:
+        spoken = not found
+        if spoken:
             found = self._mentioned_choices(text)
         if len({repr((a.name, a.args, a.kwargs)) for a, _, _ in found}) != 1:
             return None
         action, start, end = found[-1]
         marked = text[start - 1 : start] in ("`", "*", '"', "'") and text[end : end + 1] in ("`", "*", '"', "'")
-        closing = not text[end:].strip(" \t\n.!;:*`\"')]}")
+        closing = not text[end:].strip(" \t\n.!;:*`\"')]}") and (not spoken or is_meant(text[:start]))
         return action if (marked or closing) and not _NEGATED.search(text[:start].rstrip("`*\"' ") + " ") else None
 
     def _mentioned_choices(self, text: str) -> list[tuple[Action, int, int]]:

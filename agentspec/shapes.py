@@ -125,7 +125,7 @@ def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  #
         return None
     if isinstance(data, list):
         if isinstance(data[0], str) and depth:
-            name = known_name(data[0], schema)
+            name = None if data[0] in schema.choices else known_name(data[0], schema)
             if name is not None:
                 return _build(name, data[1:] if not isinstance(data[-1], str) else [], schema)
             return data[0] if "(" in data[0] or data[0] in schema.choices else None
@@ -153,7 +153,7 @@ def _named(key: str, value: str, keys: Mapping[str, Any], schema: ActionSchema) 
     """The action named by `value` under `key`, with its arguments from beside it."""
     value = value.strip()
     name = known_name(value, schema)
-    if name is None:
+    if name is None or value.casefold() in map(str.casefold, schema.choices):
         # A whole call, a menu entry, or what shall be reported as unknown; a bare "name" may be anything's.
         return value or None if key not in ("name", "call", "function", "type") or "(" in value else None
     given = next((keys[a] for a in ARGUMENTS if a in keys), None)

@@ -66,3 +66,20 @@ def task_sets(tasks: Tasks) -> dict[str, list[Task]]:
 def environment_name(env: str) -> str:
     """The registered short name of an environment, or its id."""
     return next((name for name, target in short_names().items() if target == env), env)
+
+
+def parse_seeds(texts: Sequence[str]) -> list[int]:
+    """``0-3``, ``0,1,2`` or several of these, as a list of seeds without repeats.
+
+    Raises:
+        SpecError: not of that form.
+    """
+    seeds: list[int] = []
+    for part in ",".join(texts).split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise SpecError(f"seeds {part!r}: expected numbers and ranges such as 0-15 or 0,4,8")
+        seeds += range(int(first), int(last or first) + 1)
+    if not seeds:
+        raise SpecError(f"seeds {' '.join(texts)!r} name no seed: a range counts upwards, such as 0-15")
+    return list(dict.fromkeys(seeds))

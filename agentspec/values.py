@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from agentspec import shapes
+from agentspec import remarks, shapes
 from agentspec.literals import Call, known_name, parse_call, scan_call
 from agentspec.types import Action, ActionError, ActionSchema
 
@@ -41,12 +41,13 @@ class Values:
     def __init__(self, schema: ActionSchema) -> None:
         self.schema = schema
         self.choices = {squeeze(c): c for c in schema.choices}
+        self._longest_first = sorted(schema.choices, key=len, reverse=True)
         self.scans = 0
 
     def read(self, text: str) -> Action | ActionError | None:
         """The action at the beginning of what follows a label."""
         text = DRESS.sub("", text, count=1) if text.lstrip()[:1] not in ("{", "[") else text.lstrip()
-        choice = self.choice(text)
+        choice = self.choice(text, labelled=True)
         if choice is not None:
             return choice
         if text[:1] in ("{", "[", "<"):
@@ -88,8 +89,8 @@ class Values:
         """A name without brackets, its arguments perhaps on a line of their own."""
         match = WORD.match(text)
         name = known_name(match.group(), self.schema) if match else None
-        if match is None or name is None:
-            return None
+        if match is None or name is None or (self.schema.choices and not match.group().isupper()):
+            return None  # beside a menu only capitals are a name: "wait" is an entry, or a word
         given = INPUT.search(text, match.end())
         if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
             value = (
@@ -113,17 +114,21 @@ class Values:
             return ActionError("PARSE_ARGS", problem, name)
         return Action(name, text=f"{name}()")
 
-    def choice(self, text: str) -> Action | None:
-        """The longest menu entry that `text` begins with, a remark at most after it."""
+    def choice(self, text: str, *, labelled: bool = False) -> Action | None:
+        """The longest menu entry that `text` begins with, a remark at most after it (`agentspec.remarks`)."""
         line = first_line(text)
-        squeezed = squeeze(line)
-        if squeezed in self.choices:
-            return Action(self.choices[squeezed], text=self.choices[squeezed])
         folded = line.casefold()
-        for choice in sorted(self.schema.choices, key=len, reverse=True):
-            if folded.startswith(choice.casefold()) and REMARK.match(line, len(choice)):
-                return Action(choice, text=choice)
-        return None
+        whole = self.choices.get(squeeze(line))
+        found = whole or next((c for c in self._longest_first if folded.startswith(c.casefold())), None)
+        if found is None:
+            return None
+        rest = "" if whole else line[len(found) :]
+        if rest and not REMARK.match(line, len(found)) and not remarks.gives_reason(rest):
+            return None
+        following = text[text.find(line) + len(line) :] if line else ""
+        others = [c for c in self.schema.choices if c != found]
+        meant = remarks.is_remark(rest, following, others, labelled=labelled)
+        return Action(found, text=found) if meant else None
 
 
 def squeeze(text: str) -> str:

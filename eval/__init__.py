@@ -1,13 +1,13 @@
 """Evaluation: policies x scaffolds x tasks on paired seeds, with intervals, tables and plots.
 
-:func:`evaluate` runs the matrix and keeps one JSON line per episode; :mod:`eval.tables` turns the lines into means with
-intervals (:mod:`eval.statistics` says which); :mod:`eval.plots` draws them. Only ``agentspec`` is imported here: any
-policy that can act inside a scaffold can be measured, trained by this project or not.
+`evaluate` plays the matrix and keeps every finished episode (`eval.store`); `eval.tables` turns rows into means with
+intervals (`eval.statistics` says which); `eval.plots` draws them. Only `agentspec` is imported here: any policy that
+can act inside a scaffold can be measured, trained by this project or not.
 """
 
 from agentspec.policies import Policy
-from eval.matrix import evaluate
-from eval.results import Results
+from eval.matrix import Settings, evaluate
 from eval.statistics import Estimate, mean_interval, paired
+from eval.store import Store
 
-__all__ = ["Estimate", "Policy", "Results", "evaluate", "mean_interval", "paired"]
+__all__ = ["Estimate", "Policy", "Settings", "Store", "evaluate", "mean_interval", "paired"]

@@ -1,119 +1,53 @@
 """The matrix: every policy plays every scaffold on the same tasks.
 
 Which scaffold, trained how, for which task? The answer is a table whose cells must be comparable: all policies and
-scaffolds get identical tasks (environment, options and seed) and identical seeds of their own draws. One model is in
-memory at a time and serves all of its scaffolds; each finished episode is a line of ``results.jsonl``, and a stopped
-evaluation goes on from there.
+scaffolds get identical tasks (environment, options and seed) and identical seeds of their own draws. Finished episodes
+are kept in a store (`eval.store`) from which any matrix takes what it needs, so a stopped evaluation goes on where it
+was and a larger one plays only what is new. One model is in memory at a time and serves all of its scaffolds.
 """
 
 from __future__ import annotations
 
 import asyncio
 import gc
-import hashlib
-import json
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from agentspec.actions import suggest
-from agentspec.carry import MemoryBank, play_in_order, start_bank
-from agentspec.episode import Job, MakeEnv, Runner, make_env
-from agentspec.llm.base import LLM
-from agentspec.llm.pricing import Prices
-from agentspec.metrics import episode_row
+from agentspec.episode import MakeEnv, make_env
+from agentspec.files import write_lines
 from agentspec.policies import Policy
-from agentspec.progress import episode_progress
 from agentspec.registry import SpecError
-from agentspec.spec import AgentSpec
+from agentspec.spec import MODULE_KINDS, AgentSpec
 from agentspec.tasks import Tasks, task_sets
-from agentspec.trajectory import Trajectory, jsonable, write_trajectories
-from agentspec.types import Sampling, Task
-from eval.results import Results
+from agentspec.types import Task
+from eval.cells import Cell, CellName, Planned, Settings, plan_cell
+from eval.play import LocalPlayer, MakeLLM, Play, Player
+from eval.store import Record, Store
 
-MakeLLM = Callable[[Policy], LLM | None]
+RESULTS = "results.jsonl"
+UNPLAYED = "unplayed"
+"""Status of a row whose episode was not played: its cell's limit was reached, or the cell could not be played."""
 
-GREEDY: Mapping[str, Any] = {"temperature": 0.0}
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How an evaluation plays.
-
-    Args:
-        rollouts: episodes per task (they differ in the agent's own draws; averaged before intervals are taken).
-        seed: seed of the evaluation; the same for all policies.
-        sampling: fields of :class:`~agentspec.types.Sampling` that replace those of every scaffold; ``None``: greedy.
-        concurrency: most episodes at once (``None``: all of a scaffold's).
-        timeout_s: limit of one environment call, in seconds.
-        max_steps: most steps of an episode, on top of the environment's own limit.
-        prices: dollars per token, by model name.
-        trajectories: keep every episode under ``trajectories/``.
-        start_memory: for scaffolds with ``scope: run``, a memory file or the folder of a run that wrote one: every
-            chain of episodes starts from it. A mapping gives policies, by name, starts of their own; others have none.
-        retry_failed: play cells again whose line says that they failed.
-        replace_stale: play cells again whose line is from another configuration (retrained weights, say) instead of
-            refusing them.
-    """
-
-    rollouts: int = 1
-    seed: int = 0
-    sampling: Mapping[str, Any] | None = None
-    concurrency: int | None = None
-    timeout_s: float | None = 60.0
-    max_steps: int | None = None
-    prices: Prices = field(default_factory=Prices)
-    trajectories: bool = False
-    start_memory: str | Mapping[str, str] = ""
-    retry_failed: bool = False
-    replace_stale: bool = False
-
-    def __post_init__(self) -> None:
-        if self.rollouts < 1:
-            raise ValueError(f"rollouts must be at least 1, got {self.rollouts}")
-        names = Sampling.__dataclass_fields__
-        for name in self.sampling or ():
-            if name not in names:
-                raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
-
-    def start_of(self, policy: Policy, spec: AgentSpec) -> MemoryBank:
-        """The memory that chains of episodes start from: nothing where nothing outlives an episode, or learns.
-
-        Raises:
-            SpecError: no such file, or one of other modules than the scaffold's.
-        """
-        given = self.start_memory
-        source = given if isinstance(given, str) else given.get(policy.name, "")
-        return start_bank(source if spec.scope == "run" and not policy.scripted else "", spec)
-
-    def apply(self, spec: AgentSpec) -> AgentSpec:
-        """The scaffold with the evaluation's sampling."""
-        return replace(spec, sampling=replace(spec.sampling, **(GREEDY if self.sampling is None else self.sampling)))
+OnRow = Callable[[dict[str, Any]], None]
 
 
-@dataclass(frozen=True)
-class Setting:
-    """One row-and-column pair of the matrix with what is still to play.
+class Observer:
+    """Told how an evaluation goes; does nothing."""
 
-    Args:
-        fingerprints: task key -> digest of everything that the task's rows depend on.
-        chains: lists of jobs. With `scope: run` the episodes of a chain follow each other and memory runs through.
-        start: what each chain starts from.
-    """
+    def planned(self, cells: Sequence[Cell], store: Store) -> None:
+        """All cells, before anything is played."""
 
-    policy: Policy
-    scaffold: str
-    spec: AgentSpec
-    fingerprints: Mapping[str, str]
-    chains: tuple[tuple[Job, ...], ...]
-    start: MemoryBank
+    def finished(self, cell: Cell, planned: Planned, record: Record) -> None:
+        """An episode was added to the store."""
 
-    @property
-    def jobs(self) -> list[Job]:
-        """All jobs."""
-        return [job for chain in self.chains for job in chain]
+    def failed(self, cells: Sequence[Cell], why: str) -> None:
+        """These cells cannot be played (any further)."""
+
+    def close(self) -> None:
+        """The evaluation has ended."""
 
 
 def evaluate(
@@ -122,209 +56,198 @@ def evaluate(
     tasks: Tasks,
     *,
     out: str | Path,
+    store: str | Path = "",
     settings: Settings | None = None,
     make_llm: MakeLLM | None = None,
     make_env: MakeEnv = make_env,
-    on_row: Callable[[dict[str, Any]], None] | None = None,
+    executor: str = "local",
+    workers: int = 1,
+    address: str = "",
+    on_row: OnRow | None = None,
+    observer: Observer | None = None,
     **changes: Any,
 ) -> list[dict[str, Any]]:
-    """Play policies x scaffolds x tasks and return one row per episode (see :func:`agentspec.metrics.episode_row`).
+    """Play policies x scaffolds x tasks and return one row per episode (see `agentspec.metrics.episode_row`).
+
+    A cell that cannot be played (a backend that breaks down, a scaffold that it cannot serve) stops no other: its rows
+    have the status `unplayed` and say why, and so have those that a limit left out.
 
     Args:
-        policies: rows of the matrix; names must differ.
+        policies: rows of the matrix; pairs of name and training run must differ.
         specs: scaffold by label: columns of the matrix.
         tasks: tasks, or several labelled sets of them (one table each); no task may stand in two sets.
-        out: folder of ``results.jsonl``, or another ``.jsonl`` file; existing lines are kept and their cells not
-            played again.
-        settings: how to play; keyword arguments ``changes`` are fields of it that replace its own.
+        out: folder of `results.jsonl`, the rows of this matrix as it stands now.
+        store: folder of finished episodes; default: `out`. Several matrices may share one.
+        settings: how to play; keyword arguments `changes` are fields of it that replace its own.
         make_llm: policy -> loaded backend; default: what the policy says. Called once per policy that has to play.
         make_env: task -> environment.
-        on_row: told of every finished episode.
+        executor: `local`, or `ray`: `workers` processes, here or on the cluster at `address`, with one model each.
+        on_row: told of every episode that is played now.
+        observer: told of more.
 
     Raises:
-        SpecError: names that clash, a scaffold the backend cannot serve, or lines in ``out`` from another
-            configuration under the same names.
+        SpecError: names that clash, another evaluation writing into the same store.
         ModelNotFoundError: a policy's model does not exist. As any error of making an environment (an unknown name, a
             map that is not there), it is raised before anything is played.
     """
     settings = replace(settings or Settings(), **changes)
+    sets = task_sets(tasks)
+    _check(policies, specs, settings, executor)
+    seen = observer or Observer()
+    kept = Store(store or out)
+    rows_of = [[plan_cell(p, label, spec, sets, settings, kept) for label, spec in specs.items()] for p in policies]
+    cells = [cell for row in rows_of for cell in row]
+    missing = {cell.name: _missing(cell, kept, settings) for cell in cells}
+    _check_first([row for row in rows_of if any(missing[c.name] for c in row)], sets, make_llm, make_env)
+    with kept.writing():
+        missing = {cell.name: _missing(cell, kept, settings) for cell in cells}
+        playing = [[cell for cell in row if missing[cell.name]] for row in rows_of]
+        seen.planned(cells, kept)
+        problems: dict[CellName, str] = {}
+
+        def told(cell: Cell, planned: Planned, record: Record) -> None:
+            seen.finished(cell, planned, record)
+            if on_row:
+                on_row(row_of(cell, planned, record))
+
+        try:
+            for row in filter(None, playing):
+                fresh = {key for cell in row for key in missing[cell.name] if key and kept.get(key)}
+                play = Play(kept, settings, told, fresh)
+                for cell, why in _play_policy(row, play, make_llm, make_env, executor, workers, address):
+                    problems[cell.name] = why
+                    seen.failed([cell], why)
+        finally:
+            seen.close()
+            rows = [row for cell in cells for row in rows_of_cell(cell, kept, settings, problems.get(cell.name, ""))]
+            write_lines(Path(out) / RESULTS, rows)
+    return rows
+
+
+def _play_policy(
+    cells: Sequence[Cell],
+    play: Play,
+    make_llm: MakeLLM | None,
+    make_env: MakeEnv,
+    executor: str,
+    workers: int,
+    address: str,
+) -> list[tuple[Cell, str]]:
+    """Play the cells of one policy; returns those that broke down, and why."""
+    policy, settings = cells[0].policy, play.settings
+    problems: list[tuple[Cell, str]] = []
+
+    async def each(player: Player, at_once: int | None) -> None:
+        gate = asyncio.Semaphore(at_once or sum(len(cell.chains) for cell in cells))
+        results = await asyncio.gather(*(play.cell(cell, player, gate) for cell in cells), return_exceptions=True)
+        for cell, result in zip(cells, results, strict=True):
+            if isinstance(result, BaseException):
+                problems.append((cell, _reason(result)))
+
+    try:
+        if executor == "ray":
+            from eval.ray_player import RayPlayer
+
+            with RayPlayer(policy, settings, workers, address, make_llm, make_env) as ray:
+                asyncio.run(each(ray, settings.concurrency and settings.concurrency * workers))
+        else:
+            llm = (make_llm or Policy.build)(policy)
+            asyncio.run(each(LocalPlayer(llm, settings, make_env), settings.concurrency))
+            del llm
+            gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles
+    except Exception as error:
+        return [(cell, _reason(error)) for cell in cells]
+    return problems
+
+
+def _reason(error: BaseException) -> str:
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    if not isinstance(error, Exception):
+        raise error  # Ctrl-C is nobody's failure
+    return f"{type(error).__name__}: {error}"
+
+
+def rows_of_cell(cell: Cell, store: Store, settings: Settings, problem: str = "") -> list[dict[str, Any]]:
+    """The rows of a cell as the store has them; episodes that it lacks have the status `unplayed` and a reason."""
+    by_episode: dict[tuple[str, int], dict[str, Any]] = {}
+    records: list[Record] = []
+    for chain in cell.chains:
+        found = {}
+        for planned, record, _ in cell.walk(store, chain):
+            if record is not None:
+                found[id(planned)] = record
+                records.append(record)
+        for planned in chain:
+            by_episode[planned.job.task.key, planned.job.rollout] = row_of(cell, planned, found.get(id(planned)))
+    rows = sorted(by_episode.values(), key=lambda row: row["rollout"])
+    order = {task: i for i, task in enumerate(dict.fromkeys(row["task"] for row in rows))}
+    rows.sort(key=lambda row: (order[row["task"]], row["rollout"]))
+    reason = problem or settings.limits.spent(records) or "the evaluation was stopped"
+    return [row | {"error": reason} if row["status"] == UNPLAYED else row for row in rows]
+
+
+def row_of(cell: Cell, planned: Planned, record: Record | None) -> dict[str, Any]:
+    """A row of results: names of the cell, then the episode."""
+    policy, run, scaffold = cell.name
+    names = {"policy": policy, "run": run, "scaffold": scaffold, "tasks": planned.tasks, "agent": agent_of(cell.spec)}
+    task = planned.job.task
+    if record is None:
+        unplayed = {"env": task.env, "task": task.key, "seed": task.seed, "options": dict(task.options)}
+        return names | unplayed | {"rollout": planned.job.rollout, "status": UNPLAYED, "error": "", "ended": ""}
+    kept = {name: record[name] for name in ("key", "configuration", "wall_s", "trajectory") if name in record}
+    return names | kept | record["episode"]
+
+
+def agent_of(spec: AgentSpec) -> dict[str, str]:
+    """What an agent is made of, by name."""
+    modules = {kind: getattr(spec, kind).name for kind in MODULE_KINDS}
+    return modules | {"layout": spec.layout, "scope": spec.scope}
+
+
+def _missing(cell: Cell, store: Store, settings: Settings) -> list[str]:
+    """Keys of the episodes that are to be played as far as they can be named (a chain's later ones cannot)."""
+    keys = []
+    for chain in cell.chains:
+        for planned, record, memory in cell.walk(store, chain):
+            failed = record is not None and record["episode"]["status"] == "failed"
+            if record is None or (failed and settings.retry_failed):
+                keys.append(cell.key(planned.job, memory))
+    return keys
+
+
+def _check(policies: Sequence[Policy], specs: Mapping[str, AgentSpec], settings: Settings, executor: str) -> None:
+    if executor not in ("local", "ray"):
+        raise SpecError(f"unknown executor {executor!r}{suggest(executor, ('local', 'ray'))}")
+    if not policies or not specs:
+        got = f"{len(policies)} policies and {len(specs)} scaffolds"
+        raise SpecError(f"nothing to evaluate: got {got}; give at least one of each")
+    names = [(p.name, p.run) for p in policies]
+    twice = sorted({name for name, run in names if names.count((name, run)) > 1})
+    if twice:
+        raise SpecError(f"two policies are called {', '.join(twice)}; give each its own name (NAME=MODEL)")
     if settings.start_memory and not any(spec.scope == "run" for spec in specs.values()):
         raise SpecError("start_memory is given, but no scaffold has `scope: run`: every episode would start empty")
-    sets = task_sets(tasks)
-    _check_names(policies, specs)
     if isinstance(settings.start_memory, Mapping):
         for name in settings.start_memory:
             if name not in (known := [p.name for p in policies]):
                 raise SpecError(f"start_memory names the policy {name!r}{suggest(name, known)}")
-    results = Results(out)
-    labels = {task.key: label for label, members in sets.items() for task in members}
-    plan = [
-        [_setting(policy, label, spec, sets, settings, results) for label, spec in specs.items()] for policy in policies
-    ]
-    playing = [[s for s in row if s.jobs] for row in plan]
-    _check_first(playing, sets, make_llm, make_env)
-    results.discard(
-        (s.policy.name, s.scaffold, job.task.key, job.rollout) for row in playing for s in row for job in s.jobs
-    )
-
-    def finished(setting: Setting, trajectory: Trajectory) -> None:
-        if settings.trajectories:
-            write_trajectories(_trajectory_path(results.trajectories, setting, trajectory), [trajectory])
-        row = {
-            "policy": setting.policy.name,
-            "scaffold": setting.scaffold,
-            "tasks": labels[trajectory.task.key],
-            "fingerprint": setting.fingerprints[trajectory.task.key],
-            **episode_row(trajectory),
-        }
-        results.append(row)
-        if on_row:
-            on_row(row)
-
-    for row in playing:
-        if row:
-            llm = (make_llm or Policy.build)(row[0].policy)
-            asyncio.run(_play(row, llm, settings, make_env, finished))
-            del llm
-            gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles
-    wanted = [
-        (s.policy.name, s.scaffold, key, rollout)
-        for row in plan
-        for s in row
-        for key in labels
-        for rollout in range(settings.rollouts)
-    ]
-    return [results.by_cell[cell] for cell in wanted]
-
-
-async def _play(
-    row: Sequence[Setting],
-    llm: LLM | None,
-    settings: Settings,
-    make_env: MakeEnv,
-    finished: Callable[[Setting, Trajectory], None],
-) -> None:
-    """All scaffolds of one policy, one after the other, on one loop: the backend may keep what belongs to the loop."""
-    for setting in row:
-        runner = Runner(
-            setting.spec,
-            llm,
-            make_env=make_env,
-            concurrency=settings.concurrency,
-            timeout_s=settings.timeout_s,
-            max_steps=settings.max_steps,
-            prices=settings.prices,
-            policy=setting.policy.name,
-            progress=episode_progress,
-            on_done=lambda trajectory, setting=setting: finished(setting, trajectory),  # type: ignore[misc]
-        )
-        if setting.spec.scope == "run":
-            for chain in setting.chains:
-                await play_in_order(runner, chain, setting.start)
-        else:
-            await runner.run_async(setting.jobs)
-
-
-def _setting(
-    policy: Policy,
-    label: str,
-    spec: AgentSpec,
-    sets: Mapping[str, Sequence[Task]],
-    settings: Settings,
-    results: Results,
-) -> Setting:
-    """What is left to play of one pair.
-
-    Raises:
-        SpecError: the file has lines of this pair from another configuration.
-    """
-    spec = settings.apply(policy.apply(spec))
-    start = settings.start_of(policy, spec)
-    fingerprints = _fingerprints(
-        [spec.to_data(), policy.identity(), settings.seed, settings.max_steps], spec, sets, start
-    )
-    left: list[tuple[Job, ...]] = []
-    for rollout in range(settings.rollouts):
-        for members in sets.values():
-            chain = tuple(Job(task, rollout, settings.seed) for task in members)
-            missing = tuple(j for j in chain if _is_missing(policy, label, j, fingerprints, settings, results))
-            if missing:  # memory that runs on cannot be entered in the middle
-                left.append(chain if spec.scope == "run" else missing)
-    return Setting(policy, label, spec, fingerprints, tuple(left), start)
-
-
-def _fingerprints(
-    content: list[Any], spec: AgentSpec, sets: Mapping[str, Sequence[Task]], start: MemoryBank
-) -> dict[str, str]:
-    """Task key -> digest of what its rows depend on: with `scope: run` also the start and the tasks before it."""
-
-    def digest(*more: Any) -> str:
-        text = json.dumps(jsonable([*content, *more]), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-    if spec.scope != "run":
-        return {task.key: digest() for members in sets.values() for task in members}
-    began = hashlib.sha256(start.dump()).hexdigest()
-    return {
-        task.key: digest(began, [before.key for before in members[:i]])
-        for members in sets.values()
-        for i, task in enumerate(members)
-    }
-
-
-def _is_missing(
-    policy: Policy, label: str, job: Job, fingerprints: Mapping[str, str], settings: Settings, results: Results
-) -> bool:
-    """Whether a job has no valid row yet.
-
-    Raises:
-        SpecError: it has one from another configuration.
-    """
-    row = results.by_cell.get((policy.name, label, job.task.key, job.rollout))
-    if row is None:
-        return True
-    stale = row.get("fingerprint") != fingerprints[job.task.key]
-    if stale and not settings.replace_stale:
-        raise SpecError(
-            f"{results.path} holds results of another configuration under policy {policy.name!r} and scaffold "
-            f"{label!r} (spec, weights, sampling or seed differ; with `scope: run` also the start memory, or which "
-            "tasks come before); choose another output folder or label, or replace them (replace_stale)"
-        )
-    return stale or (settings.retry_failed and row["status"] == "failed")
-
-
-def _check_names(policies: Sequence[Policy], specs: Mapping[str, AgentSpec]) -> None:
-    names = [p.name for p in policies]
-    if not names or not specs:
-        raise SpecError(f"nothing to evaluate: got {len(names)} policies and {len(specs)} scaffolds; give at least one")
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise SpecError(f"two policies are called {', '.join(twice)}; give each its own name (NAME=MODEL)")
 
 
 def _check_first(
-    playing: Sequence[Sequence[Setting]],
+    playing: Sequence[Sequence[Cell]],
     sets: Mapping[str, Sequence[Task]],
     make_llm: MakeLLM | None,
     make_env: MakeEnv,
 ) -> None:
     """Find every model and make one environment of each kind: what is missing shows before hours of work, not after."""
-    if not any(playing):
+    if not playing:
         return
     if make_llm is None:
         for row in playing:
-            if row:
-                row[0].policy.check()
+            row[0].policy.check()
     for task in {replace(t, seed=0).key: t for members in sets.values() for t in members}.values():
         make_env(task).close()
 
 
-def _trajectory_path(folder: Path, setting: Setting, trajectory: Trajectory) -> Path:
-    folder = folder / _slug(setting.policy.name) / _slug(setting.scaffold)
-    return folder / f"{trajectory.task.key}-{trajectory.rollout}.jsonl"
-
-
-def _slug(name: str) -> str:
-    """A file name that no two labels share."""
-    plain = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "x"
-    return plain if plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
+__all__ = ["Observer", "Policy", "Settings", "Task", "evaluate", "rows_of_cell"]

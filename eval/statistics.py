@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 K = TypeVar("K", bound=Hashable)
+R = TypeVar("R", bound=Hashable)
 Values = Sequence[float]
 
 LEVEL = 0.95
@@ -202,6 +203,24 @@ def compare_runs(
             return Estimate(math.nan, math.nan, math.nan, 0, "run")
         return _welch([_mean(run, common) for run in a], [_mean(run, common) for run in b], level)
     sides = [{key: math.fsum(run[key] for run in side) / max(1, len(side)) for key in common} for side in (a, b)]
+    return paired(*sides, level=level, seed=seed)
+
+
+def paired_runs(
+    a: Mapping[R, Mapping[K, float]], b: Mapping[R, Mapping[K, float]], *, level: float = LEVEL, seed: int = 0
+) -> Estimate:
+    """Mean of `a - b` where both are played by the same training runs (one policy in two scaffolds).
+
+    With `LEAST_RUNS` runs on both sides each run gives one difference (over its task seeds): a t interval over the
+    runs and its test. With fewer the runs at hand are compared over seeds, and the note says so.
+    """
+    both = [run for run in a if run in b]
+    common = _common([side[run] for run in both for side in (a, b)])
+    if len(both) >= LEAST_RUNS:
+        if not common:
+            return Estimate(math.nan, math.nan, math.nan, 0, "run")
+        return _welch([_mean(a[run], common) - _mean(b[run], common) for run in both], [0.0], level)
+    sides = [{key: math.fsum(side[run][key] for run in both) / max(1, len(both)) for key in common} for side in (a, b)]
     return paired(*sides, level=level, seed=seed)
 
 

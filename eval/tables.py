@@ -15,18 +15,24 @@ from typing import Any
 
 from agentspec.files import write_atomic
 from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
-from eval.statistics import Estimate, corrected, mean_interval, paired
+from eval.statistics import Estimate, compare_runs, corrected, paired_runs, runs_mean
 
 Row = Mapping[str, Any]
 
-DIFFERENCES = "t interval over tasks; p of a sign-flip test, Holm over the table; about these checkpoints only"
+DIFFERENCES = (
+    "t interval; p corrected by Holm over the table. n in seeds: sign-flip test over tasks, about these checkpoints "
+    "only; n in runs: t test over training runs"
+)
 
 
 @dataclass(frozen=True)
 class CellSummary:
     """One policy under one scaffold on one set of tasks: an estimate per metric, and what is behind it.
 
-    `metrics` says what the names in `estimates` are called and whether more is better, the primary one first.
+    Args:
+        runs: training runs that are this policy.
+        unplayed: episodes that were not played (a limit was reached, or the cell broke down).
+        metrics: says what the names in `estimates` are called and whether more is better, the primary one first.
     """
 
     tasks: str
@@ -37,10 +43,13 @@ class CellSummary:
     cut_short: int
     estimates: Mapping[str, Estimate]
     metrics: tuple[Metric, ...] = ()
+    runs: int = 1
+    unplayed: int = 0
 
     def to_data(self) -> dict[str, Any]:
         """JSON values."""
-        data = {k: getattr(self, k) for k in ("tasks", "policy", "scaffold", "episodes", "failed", "cut_short")}
+        names = ("tasks", "policy", "scaffold", "episodes", "failed", "cut_short", "runs", "unplayed")
+        data = {name: getattr(self, name) for name in names}
         return data | {"estimates": {name: e.to_data() for name, e in self.estimates.items()}}
 
 
@@ -53,42 +62,62 @@ def values_by_task(rows: Iterable[Row], metric: str) -> dict[str, float]:
     return {task: math.fsum(values) / len(values) for task, values in found.items()}
 
 
+def values_by_run(rows: Iterable[Row], metric: str) -> dict[str, dict[str, float]]:
+    """Training run -> task -> mean over its rollouts; a policy that is no recipe of several runs has the run `""`."""
+    runs: dict[str, list[Row]] = {}
+    for row in rows:
+        runs.setdefault(row.get("run", ""), []).append(row)
+    return {run: values_by_task(members, metric) for run, members in runs.items()}
+
+
 def summarise(rows: Sequence[Row], *, level: float = 0.95) -> list[CellSummary]:
-    """All cells, in the order of their first rows; metrics without any number are left out of ``estimates``."""
+    """All cells, in the order of their first rows; metrics without any number are left out of `estimates`.
+
+    With three training runs and more an estimate is over the runs, else over the task seeds (see `eval.statistics`).
+    """
     cells = []
     for (tasks, policy, scaffold), members in _grouped(rows).items():
-        values = {metric.name: list(values_by_task(members, metric.name).values()) for metric in columns(members)}
-        estimates = {name: mean_interval(v, level=level) for name, v in values.items() if v}
-        failed = sum(r["status"] != "completed" for r in members)
+        known = columns(members)
+        values = {m.name: [v for v in values_by_run(members, m.name).values() if v] for m in known}
+        estimates = {name: runs_mean(v, level=level) for name, v in values.items() if v}
+        failed = sum(r["status"] == "failed" for r in members)
+        unplayed = sum(r["status"] not in ("failed", "completed") for r in members)
         cut = sum(r["status"] == "completed" and r.get("ended") in CUT_SHORT for r in members)
-        shown = tuple(metric for metric in columns(members) if metric.name in estimates)
-        cells.append(CellSummary(tasks, policy, scaffold, len(members), failed, cut, estimates, shown))
+        shown = tuple(metric for metric in known if metric.name in estimates)
+        runs = len({r.get("run", "") for r in members})
+        episodes = len(members) - unplayed
+        cells.append(CellSummary(tasks, policy, scaffold, episodes, failed, cut, estimates, shown, runs, unplayed))
     return cells
 
 
 def differences(
     rows: Sequence[Row], metric: str, *, by: str = "policy", level: float = 0.95, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Paired differences to the first policy under the same scaffold (``by="scaffold"``: to the first scaffold).
+    """Paired differences to the first policy under the same scaffold (`by="scaffold"`: to the first scaffold).
 
-    The p-values are corrected over the whole table, and ``tie`` says whether a difference was shown at ``level``.
+    The p-values are corrected over the whole table, and `tie` says whether a difference was shown at `level`.
 
     Raises:
-        ValueError: ``by`` is neither ``"policy"`` nor ``"scaffold"``.
+        ValueError: `by` is neither `"policy"` nor `"scaffold"`.
     """
     if by not in ("policy", "scaffold"):
         raise ValueError(f"by must be 'policy' or 'scaffold', got {by!r}")
     fixed = "scaffold" if by == "policy" else "policy"
-    found: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
+    found: dict[tuple[str, str], dict[str, dict[str, dict[str, float]]]] = {}
     for (tasks, policy, scaffold), members in _grouped(rows).items():
         varied, held = (policy, scaffold) if by == "policy" else (scaffold, policy)
-        found.setdefault((tasks, held), {})[varied] = values_by_task(members, metric)
+        runs = {run: values for run, values in values_by_run(members, metric).items() if values}
+        found.setdefault((tasks, held), {})[varied] = runs
     named: list[tuple[dict[str, Any], Estimate]] = []
     for (tasks, held), values in found.items():
         baseline = next(iter(values))
         for name, mine in values.items():
             if name != baseline:
-                compared = paired(mine, values[baseline], level=level, seed=seed)
+                other = values[baseline]
+                if by == "policy":
+                    compared = compare_runs([*mine.values()], [*other.values()], level=level, seed=seed)
+                else:
+                    compared = paired_runs(mine, other, level=level, seed=seed)
                 named.append(({"tasks": tasks, fixed: held, by: name, "baseline": baseline}, compared))
     estimates = corrected([compared for _, compared in named])
     return [{**names, **e.to_data(), "tie": e.tie(level)} for (names, _), e in zip(named, estimates, strict=True)]
@@ -104,7 +133,7 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
         cells = summarise(members, level=level)
         metric = primary_metric(members)
         primary, heading, digits = metric.name, metric.heading, metric.digits
-        parts += [f"## {tasks}: {heading}", "", f"Mean over paired tasks, {level:.0%} t interval.", ""]
+        parts += [f"## {tasks}: {heading}", "", f"{_unit(members)}, {level:.0%} t interval.", ""]
         parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
         for by in ("policy", "scaffold"):
@@ -113,6 +142,12 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
                 parts += [f"Paired differences in {heading}, by {by} ({DIFFERENCES}):", ""]
                 parts += [*_differences(compared, by, digits), ""]
     return "\n".join(parts)
+
+
+def _unit(rows: Sequence[Row]) -> str:
+    """Over what means and intervals are taken."""
+    runs = max(len({r.get("run", "") for r in rows if r["policy"] == policy}) for policy in {r["policy"] for r in rows})
+    return "Mean over paired tasks" + (" (over training runs where a policy has three and more)" if runs > 1 else "")
 
 
 def _world(rows: Sequence[Row]) -> list[str]:
@@ -148,6 +183,13 @@ def show(estimate: Estimate | None, digits: int) -> str:
     return f"{mean} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 
+def show_p(p: float | None) -> str:
+    """`0.012`; `<0.001` below that, a dash where there is none."""
+    if p is None or math.isnan(p):
+        return "–"
+    return f"{p:.3f}" if p >= 0.001 else "<0.001"
+
+
 def _grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -174,12 +216,14 @@ def metrics_of(cells: Sequence[CellSummary]) -> list[Metric]:
 
 def _details(cells: Sequence[CellSummary]) -> list[str]:
     metrics = metrics_of(cells)
-    header = ["policy", "scaffold", "episodes", "failed", "cut short", *(m.heading for m in metrics)]
+    header = ["policy", "scaffold", "runs", "episodes", "failed", "cut short", *(m.heading for m in metrics)]
     body = []
     for c in cells:
         means = [c.estimates.get(m.name) for m in metrics]
         shown = ["–" if e is None else f"{e.mean:.{m.digits}f}" for m, e in zip(metrics, means, strict=True)]
-        body.append([c.policy, c.scaffold, str(c.episodes), str(c.failed), str(c.cut_short), *shown])
+        left_out = f" ({c.unplayed} not played)" if c.unplayed else ""
+        counted = [str(c.runs), f"{c.episodes}{left_out}", str(c.failed), str(c.cut_short)]
+        body.append([c.policy, c.scaffold, *counted, *shown])
     return table(header, body)
 
 
@@ -189,10 +233,11 @@ def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
     for row in rows:
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        p = "–" if row["p"] is None else f"{row['p']:.3f}"
+        p = show_p(row["p"])
         verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, str(row["n"])])
-    return table([fixed, "difference", "mean", "p", "verdict", "tasks"], body)
+        counted = f"{row['n']} {row['unit']}s"
+        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, counted])
+    return table([fixed, "difference", "mean", "p", "verdict", "n"], body)
 
 
 def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

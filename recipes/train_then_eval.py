@@ -13,7 +13,7 @@ from recipes.common import CONFIGS, draw_curve, run_recipe
 
 
 def main() -> None:
-    """Train, draw the reward curve, evaluate, write `evaluation.md` and `evaluation.jsonl`."""
+    """Train, draw the reward curve, evaluate, write `evaluation.md` and the episodes under `evaluation/`."""
     from trainers.arguments import parse_config
     from trainers.run import train
 
@@ -47,9 +47,7 @@ def evaluate_run(config: object, folder: Path) -> None:
         Policy("rule_based"),
         Policy("random"),
     ]
-    rows = evaluate(
-        policies, specs, tasks, out=folder / "evaluation.jsonl", sampling=config.evaluation_sampling, replace_stale=True
-    )
+    rows = evaluate(policies, specs, tasks, out=folder / "evaluation", sampling=config.evaluation_sampling)
     table = markdown(rows)
     (folder / "evaluation.md").write_text(table, encoding="utf-8")
     print(table)

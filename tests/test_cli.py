@@ -298,8 +298,16 @@ def test_eval_prints_and_writes_the_matrix(tmp_path: Path, capsys: pytest.Captur
     assert main([*command, "--plot"]) == 0
     out, err = capsys.readouterr()
     mean = sum(sum(prices(s)) for s in range(3)) / 3
-    assert f"{mean:.2f} [" in out and "| policy | plain | remembering |" in out and err.count("5 steps") == 6
-    assert {p.name for p in tmp_path.iterdir()} == {"results.jsonl", "results.md", "summary.json", "matrix.png"}
+    assert f"{mean:.2f} [" in out and "| policy | plain | remembering |" in out and "6/6 episodes" in err
+    assert {p.name for p in tmp_path.iterdir()} == {
+        ".lock",
+        "episodes.jsonl",
+        "configurations",
+        "results.jsonl",
+        "results.md",
+        "summary.json",
+        "matrix.png",
+    }
     assert main([*command, "--json"]) == 0
     out, err = capsys.readouterr()
     assert [c["episodes"] for c in json.loads(out)] == [3, 3] and err == ""  # nothing was played again

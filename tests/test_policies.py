@@ -59,4 +59,4 @@ def test_retrained_weights_are_another_policy(tmp_path: Path) -> None:
     assert policy.identity() == before
     weights.write_bytes(b"a" * 99 + b"b")
     assert policy.identity() != before
-    assert weights_digest(tmp_path) in policy.identity()["weights"]
+    assert policy.identity()["adapter"] == f"weights:{weights_digest(tmp_path)}"

@@ -11,6 +11,7 @@ import yaml
 
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tasks import parse_seeds
 
 if TYPE_CHECKING:
     from agentspec.policies import Policy
@@ -99,23 +100,6 @@ def labelled_spec(text: str) -> tuple[str, AgentSpec]:
     return label, spec
 
 
-def parse_seeds(texts: Sequence[str]) -> list[int]:
-    """``0-3``, ``0,1,2`` or several of these, as a list of seeds without repeats.
-
-    Raises:
-        SpecError: not of that form.
-    """
-    seeds: list[int] = []
-    for part in ",".join(texts).split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()):
-            raise SpecError(f"seeds {part!r}: expected numbers and ranges such as 0-15 or 0,4,8")
-        seeds += range(int(first), int(last or first) + 1)
-    if not seeds:
-        raise SpecError(f"seeds {' '.join(texts)!r} name no seed: a range counts upwards, such as 0-15")
-    return list(dict.fromkeys(seeds))
-
-
 def parse_policy(text: str, arguments: argparse.Namespace) -> Policy:
     """A policy, with the settings of ``--llm`` if it is a model."""
     from agentspec.policies import Policy
@@ -124,3 +108,15 @@ def parse_policy(text: str, arguments: argparse.Namespace) -> Policy:
     if policy.scripted:
         return policy
     return Policy(policy.name, policy.model, policy.adapter, key_values(arguments.llm, "--llm"))
+
+
+__all__ = [
+    "add_environment",
+    "add_model",
+    "environment_options",
+    "key_values",
+    "labelled_spec",
+    "load_prices",
+    "parse_policy",
+    "parse_seeds",
+]

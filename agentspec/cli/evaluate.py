@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from agentspec.cli.arguments import (
     add_environment,
@@ -23,6 +23,11 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
 
+if TYPE_CHECKING:
+    from eval.config import Matrix
+
+HELD_OUT = "20000-20007"
+
 
 def add_parser(commands: Any) -> None:
     """Arguments of ``agentspec eval``."""
@@ -32,9 +37,12 @@ def add_parser(commands: Any) -> None:
         description="Play every policy under every scaffold on the same tasks: intervals, paired tests.",
     )
     parser.add_argument(
+        "--config", metavar="FILE", help="the whole matrix as YAML (then no --policies, --specs, --seeds)"
+    )
+    parser.add_argument(
         "--policies",
         nargs="+",
-        required=True,
+        default=[],
         metavar="[NAME=]MODEL[+ADAPTER]",
         help="rule-based, random, a model, or the folder of a trained adapter",
     )
@@ -47,9 +55,9 @@ def add_parser(commands: Any) -> None:
     group.add_argument(
         "--seeds",
         nargs="+",
-        default=["20000-20007"],
+        default=[HELD_OUT],
         metavar="SEEDS",
-        help="task seeds such as 0-15 or 0,4,8 (default: %(default)s, held out from training)",
+        help=f"task seeds such as 0-15 or 0,4,8 (default: {HELD_OUT}, held out from training)",
     )
     group.add_argument("--rollouts", type=int, default=1, metavar="N", help="episodes per task")
     group.add_argument("--seed", type=int, default=0, help="seed of the agents' own draws")
@@ -64,22 +72,82 @@ def add_parser(commands: Any) -> None:
     group.add_argument(
         "--sampling", action="append", default=[], metavar="KEY=VALUE", help="sampling (default: temperature=0)"
     )
+    group.add_argument(
+        "--limit",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="episode_s, cell_s, cell_tokens or cell_dollars: what an episode or a cell may take; may be repeated",
+    )
+    group = parser.add_argument_group("where it runs")
+    group.add_argument("--executor", choices=("local", "ray"), help="this process (default), or workers through Ray")
+    group.add_argument("--workers", type=int, metavar="N", help="Ray: processes with one model each (default: 1)")
+    group.add_argument("--address", metavar="URL", help="Ray: address of a cluster (default: this machine)")
+    group.add_argument("--dry-run", action="store_true", help="print what would be played, and play nothing")
     group = parser.add_argument_group("output")
-    group.add_argument("--out", required=True, metavar="DIR", help="folder of results; a stopped run goes on there")
+    group.add_argument("--out", metavar="DIR", help="folder of results; a stopped run goes on there")
+    group.add_argument("--store", metavar="DIR", help="folder of finished episodes, may be shared (default: --out)")
     group.add_argument("--trajectories", action="store_true", help="keep every episode")
     group.add_argument("--retry-failed", action="store_true", help="play episodes again that failed")
-    group.add_argument(
-        "--replace-stale", action="store_true", help="play episodes again whose policy or scaffold has changed"
-    )
     group.add_argument("--plot", action="store_true", help="write matrix.png")
     group.add_argument("--json", action="store_true", help="print the summary as JSON instead of tables")
     parser.set_defaults(command=run, out_resumes=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play what is left to play, write the report and print it; exit code 1 if no episode could be scored."""
-    from eval.matrix import Settings, evaluate
+    """Play what is left to play, write the report and print it.
+
+    Exit code 1 if an episode could not be played or no episode could be scored.
+    """
+    from eval.live import LiveTable
+    from eval.matrix import UNPLAYED, evaluate
+    from eval.store import Store
     from eval.tables import markdown, summarise, write_report
+
+    matrix = _matrix(arguments)
+    given = {name: getattr(arguments, name) for name in ("out", "store", "executor", "workers", "address")}
+    call = dict(matrix.arguments) | {name: value for name, value in given.items() if value is not None}
+    if not call.get("out"):
+        raise SpecError("--out is missing: the folder of results (in a matrix file: `out`)")
+    if arguments.dry_run:
+        print(_summary(matrix, len(Store(call.get("store") or call["out"]))))
+        return 0
+    rows = evaluate(
+        matrix.policies, matrix.scaffolds, matrix.tasks, settings=matrix.settings, observer=LiveTable(), **call
+    )
+    write_report(rows, call["out"])
+    if arguments.plot:
+        from eval.plots import matrix_heatmap
+
+        matrix_heatmap(summarise(rows), Path(call["out"]) / "matrix.png")
+    if arguments.json:
+        print(json.dumps([cell.to_data() for cell in summarise(rows)]))
+    else:
+        print(markdown(rows))
+    statuses = {row["status"] for row in rows}
+    return 0 if "completed" in statuses and UNPLAYED not in statuses else 1
+
+
+def _matrix(arguments: argparse.Namespace) -> Matrix:
+    """What to play, from `--config` or from the other arguments.
+
+    Raises:
+        SpecError: both, or neither.
+    """
+    from eval.config import Matrix, read_matrix
+
+    if arguments.config:
+        given = [f"--{name}" for name in ("policies", "specs") if getattr(arguments, name)]
+        if given:
+            raise SpecError(f"{' and '.join(given)} beside --config: the file names policies, scaffolds and tasks")
+        matrix = read_matrix(arguments.config)
+        changed: dict[str, Any] = {name: True for name in ("trajectories", "retry_failed") if getattr(arguments, name)}
+        return replace(matrix, settings=replace(matrix.settings, **changed))
+    if not arguments.policies:
+        raise SpecError("nothing to evaluate: give --policies, or --config FILE")
+    from agentspec.tasks import task_sets
+    from eval.cells import Settings
+    from eval.limits import Limits
 
     settings = Settings(
         rollouts=arguments.rollouts,
@@ -92,22 +160,21 @@ def run(arguments: argparse.Namespace) -> int:
         trajectories=arguments.trajectories,
         start_memory=start_memory(arguments.start_memory),
         retry_failed=arguments.retry_failed,
-        replace_stale=arguments.replace_stale,
+        limits=Limits.from_data(key_values(arguments.limit, "--limit")),
     )
     options = environment_options(arguments)
-    tasks = [Task(arguments.env, seed, options, "test") for seed in parse_seeds(arguments.seeds)]
-    policies = [parse_policy(text, arguments) for text in arguments.policies]
-    rows = evaluate(policies, scaffolds(arguments.specs), tasks, out=arguments.out, settings=settings, on_row=_report)
-    write_report(rows, arguments.out)
-    if arguments.plot:
-        from eval.plots import matrix_heatmap
+    tasks = task_sets([Task(arguments.env, seed, options, "test") for seed in parse_seeds(arguments.seeds)])
+    policies = tuple(parse_policy(text, arguments) for text in arguments.policies)
+    return Matrix(policies, scaffolds(arguments.specs), tasks, settings)
 
-        matrix_heatmap(summarise(rows), Path(arguments.out) / "matrix.png")
-    if arguments.json:
-        print(json.dumps([cell.to_data() for cell in summarise(rows)]))
-    else:
-        print(markdown(rows))
-    return 0 if any(row["status"] == "completed" for row in rows) else 1
+
+def _summary(matrix: Matrix, kept: int) -> str:
+    tasks = ", ".join(f"{label} ({len(members)})" for label, members in matrix.tasks.items())
+    policies = ", ".join(f"{p.name} {p.run}".strip() for p in matrix.policies)
+    return (
+        f"policies: {policies}\nscaffolds: {', '.join(matrix.scaffolds)}\ntasks: {tasks}\n"
+        f"{matrix.episodes} episodes; the store holds {kept} (those of this matrix are not played again)"
+    )
 
 
 def start_memory(texts: Sequence[str]) -> str | dict[str, str]:
@@ -138,10 +205,3 @@ def scaffolds(texts: Sequence[str]) -> dict[str, AgentSpec]:
             raise SpecError(f"two scaffolds are labelled {label!r}; give each its own: LABEL=FILE")
         found[label] = spec
     return found
-
-
-def _report(row: dict[str, Any]) -> None:
-    """Progress and failures on stderr."""
-    what = f"{row['policy']} / {row['scaffold']} / seed {row['seed']}"
-    result = f"failed: {row['error']}" if row["status"] == "failed" else f"{row['steps']} steps"
-    sys.stderr.write(f"{what}: {result}\n")

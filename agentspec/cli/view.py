@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from agentspec.cli.logs import holds_logs, view_logs
 from agentspec.files import write_atomic
 from agentspec.memory_text import data, diff, read_bank, text
 from agentspec.registry import SpecError
@@ -25,7 +26,8 @@ def add_parser(commands: Any) -> None:
         help="print a recorded episode, or a memory",
         description="Print a recorded episode, or (--memory) what a memory file holds.",
     )
-    parser.add_argument("file", metavar="TRAJ.jsonl", nargs="?", help="trajectories, one JSON line each")
+    parser.add_argument("file", metavar="TRAJ.jsonl|DIR", nargs="?", help="trajectories, or a folder of Inspect logs")
+    parser.add_argument("--bundle", metavar="DIR", default="", help="with a folder of logs: write a static site there")
     parser.add_argument("--episode", type=int, default=0, metavar="N", help="which of them, from 0")
     parser.add_argument("--steps", default="", metavar="A-B", help="only these steps")
     parser.add_argument("--full", action="store_true", help="observations and every model call as well")
@@ -46,6 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     given = [n for n in ("diff", "task", "json", "to") if getattr(arguments, n)]
     if given:
         raise SpecError(f"--{given[0]} goes with --memory")
+    if holds_logs(arguments.file):
+        return view_logs(arguments.file, arguments.bundle)
     trajectory = _nth(Path(arguments.file), arguments.episode)
     wanted = _range(arguments.steps)
     print("\n".join(header(trajectory)))

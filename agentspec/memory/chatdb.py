@@ -28,7 +28,7 @@ from agentspec.memory.parts.steps import FEEDBACK_TOKENS, first_held, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical
-from agentspec.state import dump_state, load_state
+from agentspec.state import Json, dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -104,18 +104,22 @@ class Database:
         self._db.executescript(TABLES)
         self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
         self._words = Lexical()
+        self._rows: dict[int, Json] = {}  # the rows of `steps`, which nobody changes, as a snapshot has them
 
     def add(self, row: Sequence[Any]) -> None:
         """Insert a row of `steps`; without an id it gets the one after the highest."""
         values = tuple(row)
         cursor = self._db.execute(f"INSERT INTO steps VALUES ({','.join('?' * COLUMNS)})", values)
-        self._words.put(int(cursor.lastrowid or 0), " ".join(str(v) for v in values[3:] if isinstance(v, str)))
+        id = int(cursor.lastrowid or 0)
+        self._words.put(id, " ".join(v for v in values[3:] if isinstance(v, str)))
+        self._rows[id] = Json.of([id, *values[1:]])
 
     def trim(self, steps: int, notes: int) -> int:
         """Keep the newest rows of each table; how many went."""
         newest = "id NOT IN (SELECT id FROM steps ORDER BY id DESC LIMIT ?)"
         for (old,) in self.rows(f"SELECT id FROM steps WHERE {newest}", (steps,)):  # a constant
             self._words.remove(old)
+            del self._rows[old]
         gone = self._db.execute(f"DELETE FROM steps WHERE {newest}", (steps,)).rowcount
         newest = newest.replace("steps", "notes")
         return gone + self._db.execute(f"DELETE FROM notes WHERE {newest}", (notes,)).rowcount
@@ -152,14 +156,14 @@ class Database:
             self._db.set_authorizer(None)
         return table(names, found[:limit]) + ("\n(more rows are left out)" if len(found) > limit else "")
 
-    def state(self) -> list[Any]:
-        """JSON-like state: the rows of both tables."""
+    def state(self) -> Json:
+        """State as JSON: the rows of both tables."""
         notes = self.rows("SELECT id, note FROM notes ORDER BY id")
-        return [self.rows("SELECT * FROM steps ORDER BY id"), [[i, _plain(note)] for i, note in notes]]
+        return joined([joined(self._rows.values()), [[i, _plain(note)] for i, note in notes]])
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""
-        self._words = Lexical()
+        self._words, self._rows = Lexical(), {}
         self._db.execute("DELETE FROM steps")
         self._db.execute("DELETE FROM notes")
         for row in state[0]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -26,7 +26,7 @@ from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -71,7 +71,7 @@ class Edit:
 
 
 @dataclass(frozen=True)
-class Episode:
+class Episode(Record):
     """An experience: the situation, what mattered, what was done, what came of it."""
 
     observation: str
@@ -241,7 +241,7 @@ class LangMem:
         prompt = self._head(steps, ending) + EPISODIC.format()
         answer = await self.services.ask("episodic", prompt, self.answer_tokens, json_of(Episode))
         if answer.value is not None:
-            episode = Episode(*(self._clip(text, self.entry_tokens) for text in asdict(answer.value).values()))
+            episode = Episode(*(self._clip(text, self.entry_tokens) for text in astuple(answer.value)))
             key = self.services.new_id()
             self._put(self.episodes, self._episode_index, key, episode, episode.observation, self.max_episodes)
 
@@ -297,9 +297,8 @@ class LangMem:
         return {"facts": len(self.facts), "experiences": len(self.episodes), **self._counts}
 
     def snapshot(self) -> bytes:
-        episodes = [[key, list(asdict(episode).values())] for key, episode in self.episodes.items()]
         here = [self._steps, self._for_facts, self._for_episode, self._task]
-        return dump_state([list(self.facts.items()), episodes, self.instructions, here, self._counts])
+        return dump_state([list(self.facts.items()), keyed(self.episodes), self.instructions, here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         facts, episodes, self.instructions, here, self._counts = load_state(blob)

@@ -41,7 +41,7 @@ from agentspec.memory.parts.entries import (
 )
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Services, Time
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, Task, Transition
@@ -331,7 +331,7 @@ class Mem0Memory:
         return {"entries": len(self.entries), "evicted": self.entries.evicted, "ignored": self._ignored}
 
     def snapshot(self) -> bytes:
-        pending = [s.state() for s in self._pending]
+        pending = joined(s.json for s in self._pending)
         flags = [self._waited, self._left, self._ignored]
         return dump_state([self.entries.state(), self.summary, pending, list(self._lines), self._unsummarised, flags])
 

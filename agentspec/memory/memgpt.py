@@ -19,7 +19,7 @@ Cost per step: none to retrieve; at most 2 calls per `every` steps (1 to 2 after
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -28,7 +28,7 @@ from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import Lexical, VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -90,7 +90,7 @@ class FunctionCalls:
 
 
 @dataclass(frozen=True)
-class Message:
+class Message(Record):
     """A step as it stands in recall storage."""
 
     text: str
@@ -398,9 +398,10 @@ class MemGPT:
         return {"core_chars": chars, "archive": len(self.archive), "recall": len(self.recall), **self._counts}
 
     def snapshot(self) -> bytes:
-        recorded = [[key, list(asdict(m).values())] for key, m in self.recall.items()]
         here = [self._asked, self._queued, self._warned, self._task, self._found, self._old_task]
-        return dump_state([self.blocks, self.summary, recorded, list(self.archive.items()), here, self._counts])
+        return dump_state(
+            [self.blocks, self.summary, keyed(self.recall), list(self.archive.items()), here, self._counts]
+        )
 
     def restore(self, blob: bytes) -> None:
         self.blocks, self.summary, recorded, archive, here, self._counts = load_state(blob)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -30,7 +30,7 @@ from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -76,7 +76,7 @@ def retention(elapsed: float, strength: float, unit: float = 1.0) -> float:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Record):
     """One memory: what it says, from when, how strong it is, and the step of the run at which it was last recalled."""
 
     kind: str
@@ -374,9 +374,8 @@ class MemoryBank:
         return {**counts, "forgotten": self._forgotten, "mean_strength": strength}
 
     def snapshot(self) -> bytes:
-        entries = [[key, list(asdict(entry).values())] for key, entry in self.entries.items()]
         times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
-        return dump_state([entries, self.overview, self._merged, self._plan, self._task, times])
+        return dump_state([keyed(self.entries), self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
         entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -24,7 +24,7 @@ from agentspec.memory.parts.steps import DATA, newest_within, outcome, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -99,7 +99,7 @@ class StoreEdit:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Record):
     """An entry: its store, its fields, and when it was written last."""
 
     store: str
@@ -347,8 +347,7 @@ class Mirix:
         return {**sizes, "core_chars": len(self.core), **self._counts}
 
     def snapshot(self) -> bytes:
-        entries = [[key, list(asdict(entry).values())] for key, entry in self.entries.items()]
-        return dump_state([self.core, entries, self._steps, self._pending, self._task, self._counts])
+        return dump_state([self.core, keyed(self.entries), self._steps, self._pending, self._task, self._counts])
 
     def restore(self, blob: bytes) -> None:
         self.core, entries, self._steps, self._pending, self._task, self._counts = load_state(blob)

@@ -50,8 +50,8 @@ from agentspec.memory.parts.entries import (
     told,
 )
 from agentspec.parameters import at_least, settings
-from agentspec.services import Services, Time
-from agentspec.state import dump_state, load_state
+from agentspec.services import Services
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import excerpt
 from agentspec.trajectory import Trajectory
@@ -440,16 +440,16 @@ class SimpleMemory:
         }
 
     def snapshot(self) -> bytes:
-        archive = [[e.id, e.text, [e.time.episode, e.time.step, e.time.total], dict(e.data)] for e in self.archive]
+        archive = joined(e.json for e in self.archive)
         flags = [self._new, self._left, self._dropped]
-        window = [s.state() for s in self._window]
+        window = joined(s.json for s in self._window)
         return dump_state([self.entries.state(), archive, window, self._before, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, archive, window, self._before, self._lines, flags = load_state(blob)
         self._new, self._left, self._dropped = flags
         self.entries.load(entries)
-        self.archive = [Entry(id, text, Time(*time), data) for id, text, time, data in archive]
+        self.archive = [Entry.load(row) for row in archive]
         self._window = [Step.load(s) for s in window]
         self._rename()
 

@@ -44,16 +44,17 @@ class VectorIndex:
         self._keys: list[int] = []
         self._texts: list[str] = []
         self._row: dict[int, int] = {}
+        self._gone: list[int] = []  # rows that were removed since the last search
         self._embedded = 0
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._row)
 
     def __contains__(self, key: int) -> bool:
         return key in self._row
 
     def __iter__(self) -> Iterator[int]:
-        return iter(self._keys)
+        return iter(self._row)
 
     def text(self, key: int) -> str:
         """The text stored under `key`."""
@@ -74,14 +75,8 @@ class VectorIndex:
     def remove(self, key: int) -> None:
         """Forget `key`; one that is not there is ignored."""
         row = self._row.pop(key, None)
-        if row is None:
-            return
-        del self._keys[row], self._texts[row]
-        if row < self._embedded:
-            self._matrix[row : self._embedded - 1] = self._matrix[row + 1 : self._embedded]
-            self._embedded -= 1
-        for later in range(row, len(self._keys)):
-            self._row[self._keys[later]] = later
+        if row is not None:
+            self._gone.append(row)
 
     def search(
         self, query: str, k: int, *, where: Callable[[int], bool] | None = None, least: float = -1.0
@@ -96,7 +91,7 @@ class VectorIndex:
 
     def scores(self, query: str) -> NDArray[np.float32]:
         """Cosine similarity of `query` to every text, in the order of the keys; shape (len(self),)."""
-        self._embed_new()
+        self._settle()
         if not self._keys:
             return np.empty(0, dtype=np.float32)
         return np.asarray(self._matrix[: len(self._keys)] @ self.embedder.embed([query])[0], dtype=np.float32)
@@ -107,38 +102,51 @@ class VectorIndex:
 
     def vector(self, key: int) -> NDArray[np.float32]:
         """Unit vector of `key`, shape (dim,)."""
-        self._embed_new()
+        self._settle()
         return self._matrix[self._row[key]]
 
     def state(self) -> list[Any]:
         """JSON-like state: pairs of key and text, in order."""
-        return [[key, text] for key, text in zip(self._keys, self._texts, strict=True)]
+        return [[key, self._texts[row]] for key, row in self._row.items()]
 
     def load(self, state: Sequence[Sequence[Any]]) -> None:
         """Return to `state`. Vectors are made when they are first needed."""
         self._keys = [int(key) for key, _ in state]
         self._texts = [str(text) for _, text in state]
         self._row = {key: row for row, key in enumerate(self._keys)}
-        self._embedded = 0
+        self._gone, self._embedded = [], 0
 
     def _best(
         self, scores: NDArray[np.float32], k: int, where: Callable[[int], bool] | None, least: float
     ) -> list[tuple[int, float]]:
-        if where is None and 0 < k < len(scores):
-            # Only what may be among the first k is sorted; all that equal the k-th score stay in, so ties keep order.
-            kth = np.partition(scores, len(scores) - k)[len(scores) - k]
-            candidates = np.flatnonzero(scores >= max(float(kth), least))
-        else:
-            candidates = np.flatnonzero(scores >= least)
-        order = candidates[np.argsort(-scores[candidates], kind="stable")]
         found: list[tuple[int, float]] = []
-        for row in order:
-            if len(found) >= k:
+        looked_at, most = 0, k  # the best `most` rows are sorted; where too many are refused, four times as many
+        while k > 0:
+            rows = top_rows(scores, most)
+            for row in rows[looked_at:]:
+                if len(found) >= k or scores[row] < least:
+                    return found
+                key = self._keys[row]
+                if where is None or where(key):
+                    found.append((key, float(scores[row])))
+            if len(rows) == len(scores):
                 break
-            key = self._keys[row]
-            if where is None or where(key):
-                found.append((key, float(scores[row])))
+            looked_at, most = len(rows), 4 * most
         return found
+
+    def _settle(self) -> None:
+        """Close the gaps of what was removed, embed what is new."""
+        if self._gone:
+            kept = np.ones(len(self._keys), dtype=bool)
+            kept[self._gone] = False
+            rows = np.flatnonzero(kept)
+            embedded = rows[: np.searchsorted(rows, self._embedded)]
+            self._matrix[: len(embedded)] = self._matrix[embedded]
+            self._embedded = len(embedded)
+            self._keys, self._texts = [self._keys[i] for i in rows], [self._texts[i] for i in rows]
+            self._row = {key: row for row, key in enumerate(self._keys)}
+            self._gone = []
+        self._embed_new()
 
     def _embed_new(self) -> None:
         count = len(self._keys)

@@ -18,8 +18,10 @@ from agentspec.spec import AgentSpec
 from agentspec.tasks import task_sets
 from agentspec.trajectory import read_trajectories
 from agentspec.types import Task
+from eval.limits import Limits
 from eval.matrix import evaluate
-from eval.tables import markdown
+from eval.store import Store
+from eval.tables import differences, markdown, summarise
 from tests.toy_env import TOY
 
 PLAIN = AgentSpec()
@@ -50,6 +52,12 @@ def earned(rows: list[dict[str, Any]], **where: Any) -> list[float]:
     return [r["net_earnings"] for r in rows if all(r[k] == v for k, v in where.items())]
 
 
+def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows without what the clock decides."""
+    plain = [{k: v for k, v in row.items() if k not in ("thinking_s", "thinking_s_per_step", "wall_s")} for row in rows]
+    return [{**r, "modules": {m: t | {"latency_s": 0} for m, t in r.get("modules", {}).items()}} for r in plain]
+
+
 def test_every_policy_plays_every_scaffold_on_the_same_tasks(tmp_path: Path) -> None:
     rows, made = play(tmp_path)
     assert len(rows) == 2 * 2 * 3
@@ -75,15 +83,13 @@ def test_a_finished_evaluation_loads_no_model(tmp_path: Path) -> None:
 
 def test_a_stopped_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
     rows, _ = play(tmp_path)
-    path = tmp_path / "results.jsonl"
+    path = tmp_path / "episodes.jsonl"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:7]) + lines[7][:40])  # seven whole lines and a torn one
     again, made = play(tmp_path)
     assert made == ["waiter"]  # the seller's six were done
-    assert [{**r, "thinking_s": 0, "thinking_s_per_step": 0} for r in again] == [
-        {**r, "thinking_s": 0, "thinking_s_per_step": 0} for r in rows
-    ]
-    assert [json.loads(line)["policy"] for line in path.read_text().splitlines()] == ["seller"] * 6 + ["waiter"] * 6
+    assert timeless(again) == timeless(rows)
+    assert path.read_text().startswith("".join(lines[:7])) and len(path.read_text().splitlines()) == 12
 
 
 def test_more_tasks_and_rollouts_are_added_to_what_is_there(tmp_path: Path) -> None:
@@ -92,20 +98,94 @@ def test_more_tasks_and_rollouts_are_added_to_what_is_there(tmp_path: Path) -> N
     assert len(rows) == 2 * 2 * 4 * 2
 
 
-def test_results_of_another_configuration_are_refused(tmp_path: Path) -> None:
-    play(tmp_path, policies=[SELLER], specs={"plain": PLAIN})
+def test_a_changed_scaffold_under_an_old_name_is_played_and_the_old_episodes_stay(tmp_path: Path) -> None:
+    rows, _ = play(tmp_path, policies=[SELLER], specs={"plain": PLAIN})
     for changes in ({"specs": {"plain": SCAFFOLDS["memory"]}}, {"sampling": {"temperature": 0.5}}, {"seed": 1}):
-        with pytest.raises(SpecError, match=r"another configuration.*choose another"):
-            play(tmp_path, **{"policies": [SELLER], "specs": {"plain": PLAIN}} | changes)
+        assert play(tmp_path, **{"policies": [SELLER], "specs": {"plain": PLAIN}} | changes)[1] == ["seller"]
+    assert play(tmp_path, policies=[SELLER], specs={"plain": PLAIN}) == (rows, [])  # as if nothing had been between
+    assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 4 * 3
 
 
-def test_stale_results_can_be_replaced(tmp_path: Path) -> None:
-    out = tmp_path / "evaluation.jsonl"
-    play(out, specs={"plain": PLAIN})
-    changed = {"plain": SCAFFOLDS["memory"]}
-    rows, made = play(out, specs=changed, replace_stale=True)
-    assert made == ["seller", "waiter"] and len(rows) == len(out.read_text().splitlines()) == 6
-    assert play(out, specs=changed) == (rows, [])
+def test_matrices_share_a_store_whatever_they_call_things(tmp_path: Path) -> None:
+    rows, _ = play(tmp_path / "a", policies=[SELLER], specs={"plain": PLAIN}, store=tmp_path / "store")
+    renamed = Policy("trader", "s")
+    again, made = play(tmp_path / "b", policies=[renamed], specs={"bare": PLAIN}, store=tmp_path / "store")
+    assert made == [] and [r["net_earnings"] for r in again] == [r["net_earnings"] for r in rows]
+    assert {(r["policy"], r["scaffold"]) for r in again} == {("trader", "bare")}
+
+
+def test_weights_count_by_their_bytes_wherever_they_lie(tmp_path: Path) -> None:
+    for name, weights in (("a", b"w" * 5_000_000), ("b", b"w" * 5_000_000), ("c", b"w" * 2_000_000 + b"x" * 3_000_000)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "adapter_model.safetensors").write_bytes(weights)
+    # The third has the same size and the same first and last bytes up to the middle: only reading all of it tells.
+    a, b, c = (Policy("p", "m", str(tmp_path / name)).identity() for name in "abc")
+    assert a == b != c
+
+
+def test_one_evaluation_at_a_time_writes_into_a_store(tmp_path: Path) -> None:
+    with Store(tmp_path).writing(), pytest.raises(SpecError, match="another evaluation is writing"):
+        play(tmp_path)
+
+
+def test_training_runs_of_a_recipe_are_one_row_of_the_table(tmp_path: Path) -> None:
+    runs = [Policy("trained", f"model{i}", run=str(i)) for i in range(3)]
+    answers = {"": "WAIT()", "0": "SELL()", "1": "SELL()", "2": "WAIT()"}
+    rows = evaluate(
+        [Policy("start", "s"), *runs],
+        {"plain": PLAIN},
+        TASKS,
+        out=tmp_path,
+        make_llm=lambda policy: ScriptedLLM([answers[policy.run]]),
+    )
+    _, trained = summarise(rows)
+    assert (trained.runs, trained.episodes, trained.estimates["net_earnings"].unit) == (3, 9, "run")
+    # Two runs earn m on these tasks, one earns 0: the mean over runs is 2m/3, against a start that earns nothing.
+    m = sum(earned(rows, policy="trained")[:3]) / 3
+    [gain] = differences(rows, "net_earnings")
+    assert gain["mean"] == pytest.approx(2 * m / 3) and (gain["n"], gain["unit"]) == (3, "run")
+    assert "| start | plain | 1 | 3 |" in markdown(rows) and "| trained | plain | 3 | 9 |" in markdown(rows)
+
+
+def test_a_cell_stops_at_its_limit_and_the_table_says_so(tmp_path: Path) -> None:
+    first, _ = play(tmp_path / "free", policies=[SELLER], specs={"plain": PLAIN}, concurrency=1)
+    one = first[0]["input_tokens"] + first[0]["output_tokens"]
+    limits = Limits(cell_tokens=one + 1)  # spent once two episodes are played
+    plain = {"plain": PLAIN}
+    rows, _ = play(tmp_path / "limited", policies=[SELLER], specs=plain, concurrency=1, limits=limits)
+    assert [r["status"] for r in rows] == ["completed", "completed", "unplayed"]
+    assert rows[2]["error"].startswith("cell_tokens: ")
+    assert "| seller | plain | 1 | 2 (1 not played) | 0 |" in markdown(rows)
+    # It stays spent when the evaluation is started again, and goes on where the limit is lifted.
+    assert play(tmp_path / "limited", policies=[SELLER], specs=plain, concurrency=1, limits=limits)[0] == rows
+    assert [r["status"] for r in play(tmp_path / "limited", policies=[SELLER], specs=plain)[0]] == ["completed"] * 3
+
+
+def test_an_episode_over_its_time_limit_fails_alone(tmp_path: Path) -> None:
+    tasks = [TASKS[0], Task(TOY, 5, {"fault": "hang"})]
+    rows, _ = play(
+        tmp_path, policies=[SELLER], specs={"plain": PLAIN}, tasks=tasks, limits=Limits(episode_s=1.0), timeout_s=None
+    )
+    assert [r["status"] for r in rows] == ["completed", "failed"] and "longer than 1 s" in rows[1]["error"]
+
+
+def test_a_backend_that_breaks_down_stops_its_own_cells_only(tmp_path: Path) -> None:
+    def make(policy: Policy) -> ScriptedLLM:
+        if policy.name == "seller":
+            raise RuntimeError("out of memory")
+        return ScriptedLLM(SCRIPTS[policy.name])
+
+    rows = evaluate([SELLER, WAITER], SCAFFOLDS, TASKS, out=tmp_path, make_llm=make)
+    assert [r["status"] for r in rows] == ["unplayed"] * 6 + ["completed"] * 6
+    assert rows[0]["error"] == "RuntimeError: out of memory"
+    assert [r["status"] for r in play(tmp_path)[0]] == ["completed"] * 12  # started again, it plays what was missing
+
+
+def test_costs_are_known_by_module(tmp_path: Path) -> None:
+    rows, _ = play(tmp_path, policies=[SELLER], specs={"plain": PLAIN})
+    [(module, taken)] = rows[0]["modules"].items()
+    assert module.startswith("reasoning") and taken["calls"] == rows[0]["steps"]
+    assert taken["input_tokens"] + taken["output_tokens"] == rows[0]["input_tokens"] + rows[0]["output_tokens"]
 
 
 def test_failed_episodes_are_rows_and_can_be_retried(tmp_path: Path) -> None:
@@ -116,7 +196,9 @@ def test_failed_episodes_are_rows_and_can_be_retried(tmp_path: Path) -> None:
     assert play(tmp_path, policies=[SELLER], specs={"plain": PLAIN}, tasks=tasks)[1] == []
     again, made = play(tmp_path, policies=[SELLER], specs={"plain": PLAIN}, tasks=tasks, retry_failed=True)
     assert made == ["seller"] and len(again) == 2
-    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 2  # one line per cell
+    # One row per cell; of the store's lines about the same episode nothing was taken away.
+    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 2
+    assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 3
 
 
 def test_evaluation_is_greedy_unless_told_otherwise(tmp_path: Path) -> None:
@@ -124,7 +206,8 @@ def test_evaluation_is_greedy_unless_told_otherwise(tmp_path: Path) -> None:
     play(tmp_path / "b", policies=[SELLER], specs={"plain": PLAIN}, trajectories=True, sampling={"temperature": 0.7})
     for folder, temperature in (("a", 0.0), ("b", 0.7)):
         paths = sorted((tmp_path / folder / "trajectories/seller/plain").iterdir())
-        assert len(paths) == 3
+        rows = [json.loads(line) for line in (tmp_path / folder / "results.jsonl").read_text().splitlines()]
+        assert paths == sorted(tmp_path / folder / row["trajectory"] for row in rows) and len(paths) == 3
         [trajectory] = read_trajectories(paths[0])
         assert {c.sampling.temperature for c in trajectory.calls} == {temperature}
 
@@ -133,12 +216,14 @@ def test_memory_of_a_run_is_carried_from_episode_to_episode(tmp_path: Path) -> N
     spec = {"m": replace(SCAFFOLDS["memory"], scope="run")}
     rows, _ = play(tmp_path, policies=[SELLER], specs=spec, trajectories=True)
     assert [r["status"] for r in rows] == ["completed"] * 3
-    path = tmp_path / "results.jsonl"
+    path = tmp_path / "episodes.jsonl"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
     events: list[int] = []
-    evaluate([SELLER], spec, TASKS, out=tmp_path, make_llm=Maker(), on_row=lambda row: events.append(row["seed"]))
-    # One cell was missing, but memory that runs on starts at the first episode: all three are played, in order.
-    assert events == [0, 1, 2] and len(path.read_text().splitlines()) == 3
+    again, _ = play(
+        tmp_path, policies=[SELLER], specs=spec, trajectories=True, on_row=lambda row: events.append(row["seed"])
+    )
+    # The third was missing: memory is taken up as the second left it.
+    assert events == [2] and timeless(again) == timeless(rows)
 
 
 def test_what_cannot_work_is_refused_before_anything_is_played(tmp_path: Path) -> None:
@@ -172,6 +257,6 @@ def test_tasks_are_split_by_environment_and_options() -> None:
 
 
 def test_a_broken_results_file_is_named_with_its_line(tmp_path: Path) -> None:
-    (tmp_path / "results.jsonl").write_text('{"policy": "x"}\n')
-    with pytest.raises(ValueError, match=r"results\.jsonl, line 1"):
+    (tmp_path / "episodes.jsonl").write_text('{"policy": "x"}\n')
+    with pytest.raises(ValueError, match=r"episodes\.jsonl, line 1"):
         play(tmp_path)

@@ -40,18 +40,17 @@ def test_memory_does_not_run_from_one_set_into_the_next(tmp_path: Path) -> None:
     sets = {"first": TASKS[:2], "second": [Task(TOY, seed) for seed in (5, 6)]}
     _, idler = play(tmp_path, sets, rollouts=2)
     # Each of four chains (two sets, two rollouts) starts empty; its second episode sees its own first lesson only.
-    assert idler.seen == [[], [1], [], [3], [], [5], [], [7]]
+    assert sorted(idler.seen) == [[], [], [], [], *([n] for n in sorted(seen[0] for seen in idler.seen if seen))]
+    assert len({tuple(seen) for seen in idler.seen}) == 5
 
 
 def test_reordered_tasks_do_not_return_old_rows(tmp_path: Path) -> None:
     rows, _ = play(tmp_path, TASKS)
     assert play(tmp_path, TASKS)[0] == rows
-    with pytest.raises(SpecError, match="which tasks come before"):
-        play(tmp_path, [TASKS[1], TASKS[0], TASKS[2]])
-    with pytest.raises(SpecError, match="which tasks come before"):
-        play(tmp_path, TASKS[1:])
-    again, idler = play(tmp_path, [TASKS[1], TASKS[0], TASKS[2]], replace_stale=True)
-    assert [r["seed"] for r in again] == [1, 0, 2] and idler.seen == [[], [1], [1, 2]]
+    again, idler = play(tmp_path, [TASKS[1], TASKS[0], TASKS[2]])
+    # The third starts from the very memory that it started from before, to the byte: it is kept.
+    assert [r["seed"] for r in again] == [1, 0, 2] and idler.seen == [[], [1]]
+    assert play(tmp_path, TASKS)[0] == rows
     # Without memory over episodes the order of tasks says nothing.
     plain = AgentSpec.from_data({"reasoning": "direct"})
     play(tmp_path / "plain", TASKS, plain)
@@ -61,7 +60,9 @@ def test_reordered_tasks_do_not_return_old_rows(tmp_path: Path) -> None:
 def test_tasks_added_at_the_end_leave_other_chains_alone(tmp_path: Path) -> None:
     play(tmp_path, {"a": TASKS[:2], "b": MENU})
     rows, idler = play(tmp_path, {"a": TASKS, "b": MENU})
-    assert len(rows) == 5 and idler.seen == [[], [1], [1, 2]]  # the longer chain from its start, the other not at all
+    assert (
+        len(rows) == 5 and len(idler.seen) == 1 and len(idler.seen[0]) == 2
+    )  # the longer chain goes on, the other is not played at all
 
 
 def test_a_memory_grown_elsewhere_is_evaluated(tmp_path: Path) -> None:
@@ -86,7 +87,7 @@ def test_a_memory_grown_elsewhere_is_evaluated(tmp_path: Path) -> None:
         play(tmp_path / "misnamed", TASKS, start_memory={"idle": str(tmp_path / "run")})
     # It is part of what rows depend on.
     save_bank(tmp_path / "run" / FILE, MemoryBank.of_spec(SPEC))
-    with pytest.raises(SpecError, match="start memory"):
-        play(tmp_path / "grown", {"a": TASKS[:1], "b": TASKS[1:2]}, start_memory=str(tmp_path / "run"))
+    _, idler = play(tmp_path / "grown", {"a": TASKS[:1], "b": TASKS[1:2]}, start_memory=str(tmp_path / "run"))
+    assert idler.seen == [[], []]
     with pytest.raises(SpecError, match="no scaffold has `scope: run`"):
         play(tmp_path / "none", TASKS, AgentSpec(), start_memory=str(tmp_path / "run"))

@@ -83,10 +83,10 @@ def test_markdown_has_matrix_details_and_differences() -> None:
     # t(1, .975) = 12.706: 2 -+ 12.706 * 1 and 3.5 -+ 12.706 * 1.5; t(2, .975) = 4.3027: 38 -+ 4.3027 * 31.01
     assert "| base | 2.00 [-10.71, 14.71] | 3.50 [-15.56, 22.56] |" in text
     assert "| tuned | 38.00 [-95.41, 171.41] | – |" in text
-    assert "| base | plain | 3 | 1 | 0 | 2.00 | 10.0 |" in text
-    assert "| plain | tuned - base | 5.00 [5.00, 5.00] | 0.500 | tie | 2 |" in text
+    assert "| base | plain | 1 | 3 | 1 | 0 | 2.00 | 10.0 |" in text
+    assert "| plain | tuned - base | 5.00 [5.00, 5.00] | 0.500 | tie | 2 seeds |" in text
     # by scaffold: 2 - 1 = 1 and 5 - 3 = 2
-    assert "| base | react\\|x - plain | 1.50 [-4.85, 7.85] | 0.500 | tie | 2 |" in text
+    assert "| base | react\\|x - plain | 1.50 [-4.85, 7.85] | 0.500 | tie | 2 seeds |" in text
     assert markdown([]) == "No episodes.\n"
 
 

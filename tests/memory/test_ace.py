@@ -13,6 +13,7 @@ from agentspec.memory.ace import ACE
 from agentspec.memory.ace.playbook import Bullet, Operation, Playbook, operations_of
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.state import joined
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
 from tests.memory.recall_world import succeeds
 
@@ -161,7 +162,7 @@ def test_malformed_answers_change_nothing_and_the_review_waits() -> None:
     before = memory.playbook.state()
     learn(memory, step(1, "s1"))
     assert "State: s0" in script.prompt(1) and "State: s1" in script.prompt(1)
-    assert memory.playbook.state() == before == []
+    assert memory.playbook.state() == before == joined([])
     learn(memory, step(2, "s2"))
     assert script.prompt().count("- Insight: Look first.") == 2  # the review whose curation failed, and the new one
     assert memory.playbook.state() == []

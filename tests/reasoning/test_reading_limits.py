@@ -7,9 +7,10 @@ import time
 import pytest
 
 from agentspec.actions import canonical, parse_action
+from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.world.grammar import schema_for
 from agentspec.envs.deliverybench.world.rules import FAIR
-from agentspec.types import Action, ActionSchema
+from agentspec.types import Action, ActionError, ActionSchema
 
 SCHEMA = schema_for(FAIR)
 CALL = "MOVE(120.5m, -48m)"
@@ -74,3 +75,43 @@ def test_an_action_after_many_words_is_found(words: int) -> None:
     for text in (f"{'word ' * words}\nAction: {CALL}", f"Action: {CALL}\n{'word ' * words}"):
         action = parse_action(text, SCHEMA)
         assert isinstance(action, Action) and action.name == "MOVE"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MOVE((120.5m, -48m))",
+        "MOVE([120.5, -48])",
+        "MOVE(to=(120.5m, -48m))",
+        "MOVE(position=[120.5, -48])",
+        'MOVE({"x": 120.5, "y": -48})',
+        'MOVE(target={"x": 120.5, "y": "-48m"})',
+        '{"action": "MOVE", "args": [[120.5, -48]]}',
+        '{"action": "MOVE", "args": {"to": ["120.5m", "-48m"]}}',
+        '{"name": "MOVE", "arguments": {"destination": {"x": 120.5, "y": -48}}}',
+    ],
+)
+def test_a_point_given_as_one_value_is_the_point(text: str) -> None:
+    action, meant = parse_action(text, SCHEMA), parse_action(CALL, SCHEMA)
+    assert isinstance(action, Action) and isinstance(meant, Action)
+    assert canonical(action, SCHEMA) == canonical(meant, SCHEMA)
+    fast = parse_action("MOVE((120.5m, -48m), pace='accel')", SCHEMA)
+    assert isinstance(fast, Action) and fast.args == (120.5, -48.0) and fast.kwargs == {"pace": "accel"}
+    world = DeliveryBenchEnv(size="tiny")
+    world.reset(seed=0)
+    assert not world.step("MOVE((10m, 5m))")[4]["error"].startswith("MOVE:")  # the arguments are none of its complaints
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["MOVE((1, 2, 3))", "MOVE(to=(1,))", "MOVE(x=(1, 2))", "MOVE(to='restaurant 1')", "MOVE((1, 2), (3, 4))", "MOVE()"],
+)
+def test_what_is_no_point_is_told_so(text: str) -> None:
+    error = parse_action(text, SCHEMA)
+    assert isinstance(error, ActionError) and error.code == "PARSE_ARGS"
+    assert "write MOVE(120.5m, -48m" in error.message
+
+
+def test_a_list_of_one_is_the_one() -> None:
+    action = parse_action('DROP_OFF(oid=[3], method=["knock"])', SCHEMA)
+    assert isinstance(action, Action) and action.kwargs == {"oid": 3, "method": "knock"}

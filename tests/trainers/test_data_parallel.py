@@ -34,6 +34,7 @@ from tests.trainers.builders import call, episode, instead_of_playing
 from trainers import grpo as grpo_module
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
+from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.distributed import leave_group
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import load_state
@@ -59,7 +60,12 @@ CASES: dict[str, dict[str, Any]] = {
     # The second round starts from lessons that the best rollout of the first wrote, on whichever process it was.
     "carried": {"num_generations": 8, "memory_carry": "best", "save_strategy": "steps", "save_steps": 1},
     "cut": {"num_generations": 8, "save_strategy": "steps", "save_steps": 1, "steps_per_generation": 4},
+    # Writes to memory are credited by episodes beside the batch; the pairs of a group span both processes.
+    "local": {"num_generations": 8, "max_steps": 1, "write_credit": "local"},
+    "ablation": {"num_generations": 8, "max_steps": 1, "write_credit": "ablation"},
 }
+WRITES = ("local", "ablation")
+PLAYED = ("played", "carried", "cut", *WRITES)
 
 
 def built_episode(case: str, job: Job) -> Trajectory:
@@ -125,7 +131,7 @@ class _Stop(TrainerCallback):
 def run_cases(out: Path, processes: int) -> None:
     """What every process does: train each case; the main process writes the weights."""
     for case in CASES:
-        built = case not in ("played", "carried", "cut")
+        built = case not in PLAYED
         grpo_module.collect = (  # type: ignore[assignment]
             instead_of_playing(lambda jobs, case=case: [built_episode(case, j) for j in jobs]) if built else collect
         )
@@ -181,7 +187,7 @@ def test_two_processes_take_the_step_of_one(runs: tuple[Path, Path], case: str) 
     assert max((one[n] - two[n]).abs().max().item() for n in one) < 1e-6
 
 
-@pytest.mark.parametrize("case", ["tree", "failed", "played", "carried", "cut"])
+@pytest.mark.parametrize("case", ["tree", "failed", *PLAYED])
 def test_the_logs_of_two_processes_are_those_of_one(runs: tuple[Path, Path], case: str) -> None:
     one, two = (RunLog(folder / case).read("updates.jsonl") for folder in runs)
     assert len(one) == len(two) > 0
@@ -195,7 +201,7 @@ def test_the_logs_of_two_processes_are_those_of_one(runs: tuple[Path, Path], cas
         assert a["grad_norm"] == pytest.approx(b["grad_norm"], rel=1e-4)
 
 
-@pytest.mark.parametrize("case", ["played", "cut"])
+@pytest.mark.parametrize("case", ["played", "cut", *WRITES])
 def test_the_audit_reads_the_episodes_of_every_process(runs: tuple[Path, Path], case: str) -> None:
     files = {p.name for p in (runs[1] / case / "trajectories").glob("*.jsonl")}
     assert {"000000.jsonl", "000000.rank1.jsonl"} <= files
@@ -213,6 +219,29 @@ def test_every_process_carries_the_same_memory(runs: tuple[Path, Path]) -> None:
     alone = load_state(runs[0] / "carried" / "checkpoint-1")
     assert first is not None and second is not None and alone is not None
     assert first.memory is not None and first.memory == second.memory == alone.memory
+
+
+@pytest.mark.parametrize("case", WRITES)
+def test_writes_earn_the_same_on_two_processes_as_on_one(runs: tuple[Path, Path], case: str) -> None:
+    played, updates = [], []
+    for folder in runs:
+        log = RunLog(folder / case)
+        records = [json.loads(line) for p in log_files(folder / case) for line in p.read_text().splitlines()]
+        played.append(records)
+        updates.append(log.read("updates.jsonl"))
+    # Eight twins, or one write of each of the eight episodes re-rolled twice with and twice without it.
+    assert [len(p) for p in played] == [8 if case == "ablation" else 32] * 2
+    assert len(log_files(runs[1] / case)) == 2  # each process played those of its own episodes
+    one, two = ([sum(step["reward"] for step in r["steps"]) for r in records] for records in played)
+    assert one == two and len(set(one)) > 1
+    advantages = [[r["advantage"] for u in us for r in u["rows"]] for us in updates]
+    assert advantages[0] == advantages[1]
+    assert len({a for row in advantages[0] if isinstance(row, list) for a in row}) > 1  # some write earned something
+
+
+def log_files(run: Path) -> list[Path]:
+    """The files of a run's counterfactuals, in the order of the processes."""
+    return sorted((run / COUNTERFACTUALS).glob("*.jsonl"))
 
 
 def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:

@@ -80,6 +80,7 @@ class AlfredEnv(Game):
         ),
         "typical_return": 1.0,
     }
+    failure_signs: ClassVar[str] = "agentspec.envs.thor.signs:alfred"
     experts: ClassVar[dict[str, str]] = {
         "rule_based": "agentspec.envs.alfred.expert:expert",
         "random": "agentspec.envs.alfred.expert:luck",

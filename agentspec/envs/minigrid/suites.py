@@ -1,7 +1,8 @@
-"""Which grids are played: the paper's ten tasks, suites where remembering decides, and BabyAI levels.
+"""Which grids are played: the paper's ten tasks, suites where remembering decides, BabyAI levels, and practice.
 
 A suite turns an episode's seed into a registered MiniGrid id and a layout seed. `paper` is the ten fixed layouts of the
 AgentSpec paper (seed modulo ten selects one); the other suites cycle through their ids and use the seed for the layout.
+`practice` is what to train on before playing `paper` or `memory`: their ids, with none of the ten layout seeds.
 """
 
 from __future__ import annotations
@@ -36,9 +37,12 @@ PAPER: tuple[Layout, ...] = (
 )
 """The ten tasks of the AgentSpec paper with their optima (actions, turns included), found by breadth-first search."""
 
+MEMORY = ("MiniGrid-MemoryS7-v0", "MiniGrid-RedBlueDoors-6x6-v0", "MiniGrid-ObstructedMaze-1Dlh-v0")
+
 SUITES: Mapping[str, tuple[str, ...]] = {
     "paper": tuple(layout.id for layout in PAPER),
-    "memory": ("MiniGrid-MemoryS7-v0", "MiniGrid-RedBlueDoors-6x6-v0", "MiniGrid-ObstructedMaze-1Dlh-v0"),
+    "memory": MEMORY,
+    "practice": (*(layout.id for layout in PAPER), *MEMORY),
     "babyai": (
         "BabyAI-GoToObjS6-v1",
         "BabyAI-GoToLocalS5N2-v0",
@@ -77,7 +81,7 @@ def layout_of(*, suite: str = "", level: str = "", task: str = "", seed: int = 0
     if suite == "paper":
         return PAPER[seed % len(PAPER)]
     ids = SUITES[suite]
-    return Layout(ids[seed % len(ids)], seed)
+    return Layout(ids[seed % len(ids)], seed)  # no (id, seed) of `practice` is one of the ten: a test
 
 
 def _registered(level: str) -> str:

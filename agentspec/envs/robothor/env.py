@@ -109,6 +109,7 @@ class RoboThorEnv(Game):
         ),
         "typical_return": 1.0,
     }
+    failure_signs: ClassVar[str] = "agentspec.envs.thor.signs:robothor"
     experts: ClassVar[dict[str, str]] = {
         "rule_based": "agentspec.envs.robothor.expert:expert",
         "random": "agentspec.envs.robothor.expert:luck",

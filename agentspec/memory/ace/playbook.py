@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from agentspec.state import Json, Record, joined
 from agentspec.structured import ParseError, check
 from agentspec.tokens import CountTokens
 
@@ -23,7 +24,7 @@ Tag = Literal["helpful", "harmful", "neutral"]
 
 
 @dataclass(frozen=True)
-class Bullet:
+class Bullet(Record):
     """One entry: its number (never given twice), section, text, and how often it was found helpful and harmful."""
 
     number: int
@@ -148,9 +149,9 @@ class Playbook:
             dropped.append(bullet)
         return dropped
 
-    def state(self) -> list[Any]:
-        """JSON-like state."""
-        return [[b.number, b.section, b.text, b.helpful, b.harmful] for b in self]
+    def state(self) -> Json:
+        """State as JSON."""
+        return joined(b.json for b in self)
 
     @classmethod
     def load(cls, state: Iterable[Sequence[Any]]) -> Playbook:

@@ -18,6 +18,9 @@ recalled longest ago goes first.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.amem import prompts
@@ -26,7 +29,7 @@ from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -119,8 +122,9 @@ class AMem:
         if self._due:
             self._due = False
             waiting, self._plain = self._plain, []
-            for note in [self._notes[id] for id in waiting if id in self._notes]:
-                await self._write(note)
+            for id in waiting:
+                if id in self._notes:
+                    await self._write(self._notes[id])
         source = self.services.llm.module
         texts = [self._shown(note) for note in self._found(input.text, k or self.top)]
         recall = telling.listed([*([telling.NOTES] if texts else []), *texts], source)
@@ -150,8 +154,7 @@ class AMem:
             self._plain = [self._keep().id]
         elif self._notes:
             note = self.notes[-1]
-            note.steps = [*note.steps, ["", ended]]
-            self._embed(note)
+            self._change(note, steps=[*note.steps, ["", ended]])
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
@@ -165,8 +168,13 @@ class AMem:
             del self._notes[oldest.id]
             if self._index is not None:
                 self._index.remove(oldest.id)
-        self._notes[note.id] = note
-        self._embed(note)
+        return self._change(note)
+
+    def _change(self, note: Note, **fields: Any) -> Note:
+        """The note with other fields, in place of the one with its id."""
+        note = self._notes[note.id] = replace(self._notes.get(note.id, note), **fields)
+        if self._index is not None:
+            self._index.put(note.id, note.text())
         return note
 
     async def _write(self, note: Note) -> None:
@@ -177,9 +185,8 @@ class AMem:
             "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs)
         )
         if analysed.value is not None:
-            note.keywords, note.tags = words(analysed.value.keywords), words(analysed.value.tags)
-            note.context = self._line(analysed.value.context)
-            self._embed(note)
+            keywords, tags = words(analysed.value.keywords), words(analysed.value.tags)
+            note = self._change(note, keywords=keywords, tags=tags, context=self._line(analysed.value.context))
         near = self._near(note)
         if not near:
             return
@@ -198,23 +205,17 @@ class AMem:
         """Carry out a decision about `note` and the notes that were shown; ids of others are passed over."""
         shown = {other.id: other for other in near}
         links = dict.fromkeys(id_of(name) for name in change.links)
-        note.links = [id for id in links if id in shown]
-        note.tags = words(change.tags) or note.tags
-        self._embed(note)
+        self._change(note, links=[id for id in links if id in shown], tags=words(change.tags) or note.tags)
         for wanted in change.neighbours:
             other = shown.get(id_of(wanted.id))
             if other is None:
                 continue
+            other = self._notes[other.id]  # as an earlier item of the answer has left it
             context = self._line(wanted.context) or other.context
-            if context != other.context and other.context:
-                other.history = [*other.history, other.context][-MOST_HISTORY:]
-            other.context, other.tags = context, words(wanted.tags) or other.tags
-            self._embed(other)
+            replaced = [other.context] if other.context not in ("", context) else []
+            history = [*other.history, *replaced][-MOST_HISTORY:]
+            self._change(other, context=context, tags=words(wanted.tags) or other.tags, history=history)
             self._evolved += 1
-
-    def _embed(self, note: Note) -> None:
-        if self._index is not None and note.id in self._notes:
-            self._index.put(note.id, note.text())
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -227,9 +228,9 @@ class AMem:
         nearest = [id for id, _ in self._index.search(text, top)] if self._index is not None else []
         linked = [id for near in nearest for id in self._notes[near].links if id in self._notes and id not in nearest]
         found = [self._notes[id] for id in [*nearest, *list(dict.fromkeys(linked))[:top]]]
+        now = self.services.time().total
         for note in found:
-            note.recalled += 1
-            note.used = self.services.time().total
+            self._notes[note.id] = replace(note, recalled=note.recalled + 1, used=now)
         return found
 
     def _shown(self, note: Note) -> str:
@@ -250,7 +251,7 @@ class AMem:
 
     def snapshot(self) -> bytes:
         order = list(self._index) if self._index is not None else []
-        notes = [note.row() for note in self._notes.values()]
+        notes = joined(note.json for note in self._notes.values())
         return dump_state([notes, order, self._open, self._plain, self._due, self._evolved])
 
     def restore(self, blob: bytes) -> None:

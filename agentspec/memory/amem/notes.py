@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+
+from agentspec.state import Record
 
 MOST_WORDS = 8
 """Keywords, and tags, of a note."""
 
 
-@dataclass
-class Note:
+@dataclass(frozen=True)
+class Note(Record):
     """One note: steps as pairs of state and line (see `telling.course`), and what the model says of them.
 
     `written` and `used` (when it was written or recalled last) are in steps of the run.
@@ -32,11 +33,6 @@ class Note:
     def name(self) -> str:
         """The id that the model sees."""
         return f"n{self.id}"
-
-    def row(self) -> list[Any]:
-        """JSON-like fields in the order of the constructor's arguments."""
-        about = [self.keywords, self.context, self.tags, self.links]
-        return [self.id, self.steps, self.written, self.episode, *about, self.used, self.recalled, self.history]
 
     def text(self) -> str:
         """What is embedded: content, context, keywords and tags."""

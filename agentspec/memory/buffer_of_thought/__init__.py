@@ -38,7 +38,7 @@ from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -286,13 +286,12 @@ class BufferOfThought:
         return {"size": len(self._buffer), **self._figures}
 
     def snapshot(self) -> bytes:
-        buffer = [[key, asdict(template)] for key, template in self._buffer.items()]
         episode = [self._problem, self._working, self._looked_up, self._started]
-        return dump_state([buffer, episode, self._course, self._finished, self._figures])
+        return dump_state([keyed(self._buffer), episode, self._course, self._finished, self._figures])
 
     def restore(self, blob: bytes) -> None:
         buffer, episode, self._course, self._finished, self._figures = load_state(blob)
         self._problem, self._working, self._looked_up, self._started = episode
-        self._buffer = {key: Template(**data) for key, data in buffer}
+        self._buffer = {key: Template(*row) for key, row in buffer}
         if self._index is not None:
             self._index.load([(key, template.description) for key, template in self._buffer.items()])

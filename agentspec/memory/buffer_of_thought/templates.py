@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from agentspec.state import Record
+
 
 @dataclass(frozen=True)
-class Template:
+class Template(Record):
     """A way of working: what it is called, for which tasks it is, its steps, and how often it was looked up."""
 
     category: str

@@ -44,7 +44,7 @@ from agentspec.memory.parts.entries import (
 )
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Answer, Services
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import excerpt
 from agentspec.trajectory import Trajectory
@@ -361,7 +361,7 @@ class CamMemory:
     def snapshot(self) -> bytes:
         levels = [level.state() for level in self.levels]
         parents = [list(p.items()) for p in self.parents]
-        pending = [s.state() for s in self._pending]
+        pending = joined(s.json for s in self._pending)
         return dump_state([self.nodes.state(), levels, parents, pending, self._lines, self._left, self._evicted])
 
     def restore(self, blob: bytes) -> None:

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex, top_rows
-from agentspec.state import dump_state, load_state
+from agentspec.state import Record, dump_state, keyed, load_state
 from agentspec.structured import ParseError, Parser
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
@@ -68,6 +69,15 @@ def read_sheet(text: str, tags: bool = True) -> str:
     if not sheet:
         raise ParseError("the sheet is empty")
     return str(sheet)
+
+
+@dataclass(frozen=True)
+class Pair(Record):
+    """A step of the retrieval-synthesis variant: the state it is found by, its episode, and how it is told."""
+
+    state: str
+    episode: int
+    block: str
 
 
 class DynamicCheatsheet:
@@ -139,7 +149,7 @@ class DynamicCheatsheet:
         self._lines: list[str] = []  # the same as the agent is told them
         self._waited = 0  # steps since the curator was last asked
         self._due = False  # whether an earlier episode left something to be curated
-        self._pairs: dict[int, tuple[int, str]] = {}  # `rs`: episode and step; the index holds their states
+        self._pairs: dict[int, Pair] = {}  # `rs`: steps by key
         self._rewrites = 0
 
     @property
@@ -187,8 +197,8 @@ class DynamicCheatsheet:
             self._since = [*self._since, ended][-self._most_waiting :]
         if self._pairs:
             newest = next(reversed(self._pairs))
-            episode, block = self._pairs[newest]
-            self._pairs[newest] = (episode, f"{block}\n{ended}")
+            pair = self._pairs[newest]
+            self._pairs[newest] = replace(pair, block=f"{pair.block}\n{ended}")
 
     @property
     def _name(self) -> str:
@@ -214,7 +224,7 @@ class DynamicCheatsheet:
         found = self._similar(input.text, top)
         now = self.services.time().episode
         pairs = [
-            f"{telling.when(self._pairs[key][0], now)}Similarity {score:.2f}:\n{self._pairs[key][1]}"
+            f"{telling.when(self._pairs[key].episode, now)}Similarity {score:.2f}:\n{self._pairs[key].block}"
             for key, score in found
         ]
         shown = [f"{prompts.SIMILAR}\n{telling.numbered(pairs)}"] if pairs else []
@@ -227,7 +237,7 @@ class DynamicCheatsheet:
         enough."""
         assert self._index is not None
         scores, keys = self._index.scores(text), list(self._pairs)  # in the same order
-        of = np.fromiter((episode for episode, _ in self._pairs.values()), dtype=np.int64, count=len(keys))
+        of = np.fromiter((pair.episode for pair in self._pairs.values()), dtype=np.int64, count=len(keys))
         known = np.arange(len(keys)) >= len(keys) - len(self._unseen)  # they are the newest
         earlier = (of != self.services.time().episode) & ~known
         found: list[tuple[int, float]] = []
@@ -287,7 +297,7 @@ class DynamicCheatsheet:
             return
         key = self.services.new_id()
         self._index.put(key, state)
-        self._pairs[key] = (self.services.time().episode, block)
+        self._pairs[key] = Pair(state, self.services.time().episode, block)
         if self.every > 1:
             self._unseen = [*self._unseen, key][-self._most_waiting :]
         while len(self._pairs) > self.capacity:
@@ -302,14 +312,12 @@ class DynamicCheatsheet:
         return {"rewrites": self._rewrites, "sheet_tokens": self._count(self._sheet), "steps": len(self._pairs)}
 
     def snapshot(self) -> bytes:
-        index = self._index.state() if self._index is not None else []
-        pairs = [[key, state, *self._pairs[key]] for key, state in index]
         flags = [self._waited, self._due, self._rewrites]
-        return dump_state([self._sheet, self._since, self._unseen, self._lines, flags, pairs])
+        return dump_state([self._sheet, self._since, self._unseen, self._lines, flags, keyed(self._pairs)])
 
     def restore(self, blob: bytes) -> None:
         self._sheet, self._since, self._unseen, self._lines, flags, pairs = load_state(blob)
         self._waited, self._due, self._rewrites = flags
-        self._pairs = {key: (episode, block) for key, _, episode, block in pairs}
+        self._pairs = {key: Pair(*row) for key, row in pairs}
         if self._index is not None:
-            self._index.load([(key, state) for key, state, *_ in pairs])
+            self._index.load([(key, pair.state) for key, pair in self._pairs.items()])

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from agentspec.protocols import Embedder
 from agentspec.retrieval import VectorIndex, top_rows
+from agentspec.state import Json, Record, joined
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Memory:
+class Memory(Record):
     """An event (the state, and a line that says what was done) or a thought (a line, and the ids it rests on)."""
 
     id: int
@@ -120,11 +121,11 @@ class Stream:
         ids = list(self._memories) if len(best) else []
         return [(self._memories[ids[row]], float(scores[row])) for row in best]
 
-    def state(self) -> list[Any]:
-        """JSON-like state."""
+    def state(self) -> Json:
+        """State as JSON."""
         n = len(self._memories)
-        rows = [[m.id, m.line, m.state, m.episode, m.thought, m.evidence] for m in self]
-        return [rows, self._used[:n].tolist(), self._importance[:n].tolist(), self.evicted]
+        used, importance = self._used[:n].tolist(), self._importance[:n].tolist()
+        return joined([joined(m.json for m in self), used, importance, self.evicted])
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""

@@ -54,7 +54,7 @@ from agentspec.memory.parts.entries import (
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.registry import SpecError
 from agentspec.services import Services
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, Task, Transition
@@ -354,8 +354,8 @@ class LightMemory:
         }
 
     def snapshot(self) -> bytes:
-        topics = [[topic, [s.state() for s in steps]] for topic, steps in self.topics]
-        sensory = [s.state() for s in self.sensory]
+        topics = [[topic, [s.row() for s in steps]] for topic, steps in self.topics]
+        sensory = joined(s.json for s in self.sensory)
         flags = [self._topic, self._asleep]
         return dump_state([self.entries.state(), self.words.counts, sensory, topics, self._lines, flags])
 

@@ -18,7 +18,7 @@ and only where a later episode starts from this one's memory. `preset: paper` st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -30,7 +30,7 @@ from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import Lexical, VectorIndex
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -199,7 +199,7 @@ class OpenClaw:
         items += [RecallItem(self._named(c), source=self._log_path(c.episode), priority=3.5) for c in notes]
         for key, score in self._searched(input.text, self.search if k is None else k):
             chunk = self.log[key]
-            chunk.recalled(score, input.text, now.episode)
+            self.log[key] = chunk.recalled(score, input.text, now.episode)
             items.append(RecallItem(self._named(chunk), score, source=self._log_path(chunk.episode), priority=score))
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
@@ -325,7 +325,7 @@ class OpenClaw:
             return
         self._write_rules(rules)
         for _, key in best:
-            self.log[key].promoted = True
+            self.log[key] = replace(self.log[key], promoted=True)
         self._counts["promoted"] += len(best)
 
     def _append(self, text: str, step: int, *, note: bool = False) -> None:
@@ -434,15 +434,14 @@ class OpenClaw:
 
     def snapshot(self) -> bytes:
         skills = [asdict(skill) for skill in self.skills.values()]
-        log = [[key, list(asdict(chunk).values())] for key, chunk in self.log.items()]
         here = [self._since, self._held_from, self._flushed, self._task]
-        return dump_state([rules_text(self.rules), skills, log, here, self._counts])
+        return dump_state([rules_text(self.rules), skills, keyed(self.log), here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         rules, skills, log, here, self._counts = load_state(blob)
         self.rules = rules_of(rules)
         self.skills = {slug(s["name"]): Skill(**s) for s in skills}
-        self.log = {key: Chunk(*values) for key, values in log}
+        self.log = {key: Chunk.load(row) for key, row in log}
         self._since, self._held_from, self._flushed, self._task = here
         self._build_indices()
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from agentspec.retrieval import Lexical, VectorIndex, mmr
+from agentspec.state import Record
 
 VECTOR_WEIGHT, TEXT_WEIGHT = 0.7, 0.3
 POOL = 4
@@ -28,8 +31,8 @@ QUERIES_KEPT = 16
 _TERM = re.compile(r"[^\W_]+(?:\.\d+)?")
 
 
-@dataclass
-class Chunk:
+@dataclass(frozen=True)
+class Chunk(Record):
     """One entry of a log, and how it has been recalled.
 
     Args:
@@ -50,19 +53,26 @@ class Chunk:
     note: bool = False
     recalls: int = 0
     relevance: float = 0.0
-    queries: list[str] = field(default_factory=list)
-    episodes: list[int] = field(default_factory=list)
+    queries: tuple[str, ...] = ()
+    episodes: tuple[int, ...] = ()
     promoted: bool = False
 
-    def recalled(self, score: float, query: str, episode: int) -> None:
-        """Count a recall."""
-        self.recalls += 1
-        self.relevance += score
+    def recalled(self, score: float, query: str, episode: int) -> Chunk:
+        """The same entry, recalled once more."""
         digest = hashlib.blake2b(query.encode("utf-8", "replace"), digest_size=6).hexdigest()
-        if digest not in self.queries:
-            self.queries = [*self.queries, digest][-QUERIES_KEPT:]
-        if episode not in self.episodes:
-            self.episodes.append(episode)
+        return replace(
+            self,
+            recalls=self.recalls + 1,
+            relevance=self.relevance + score,
+            queries=self.queries if digest in self.queries else (*self.queries, digest)[-QUERIES_KEPT:],
+            episodes=self.episodes if episode in self.episodes else (*self.episodes, episode),
+        )
+
+    @classmethod
+    def load(cls, row: Sequence[Any]) -> Chunk:
+        """What `row` gave."""
+        *before, queries, episodes, promoted = row
+        return cls(*before, tuple(queries), tuple(episodes), promoted)
 
 
 def hybrid(

@@ -8,6 +8,7 @@ action can profit from, and what is asked is paid for by the episode that reads 
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,12 +21,13 @@ from agentspec.protocols import Embedder, Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import Lexical, VectorIndex
 from agentspec.services import Time
+from agentspec.state import Json, Record, joined
 from agentspec.tokens import clip_text
 from agentspec.types import Experience, Recall, RecallItem, Transition
 
 
 @dataclass(frozen=True)
-class Entry:
+class Entry(Record):
     """One note.
 
     Args:
@@ -40,9 +42,18 @@ class Entry:
     time: Time = Time(0, 0, 0)
     data: Mapping[str, Any] = field(default_factory=dict)
 
+    def row(self) -> list[Any]:
+        return [self.id, self.text, numbers(self.time), dict(self.data)]
+
+    @classmethod
+    def load(cls, row: Sequence[Any]) -> Entry:
+        """What `row` gave."""
+        id, text, time, data = row
+        return cls(id, text, Time(*time), data)
+
 
 @dataclass(frozen=True)
-class Step:
+class Step(Record):
     """A step that waits to become notes: when it was, told in full, and in one line."""
 
     time: Time
@@ -57,13 +68,12 @@ class Step:
         seen = Experience.of(transition)
         return cls(time, seen.block(tokens, services.llm.count_tokens), seen.line())
 
-    def state(self) -> list[Any]:
-        """JSON-like state."""
-        return [_numbers(self.time), self.text, self.line]
+    def row(self) -> list[Any]:
+        return [numbers(self.time), self.text, self.line]
 
     @classmethod
     def load(cls, state: Sequence[Any]) -> Step:
-        """What `state` gave."""
+        """What `row` gave."""
         return cls(Time(*state[0]), state[1], state[2])
 
 
@@ -79,6 +89,12 @@ class Entries:
     def __init__(self, embedder: Embedder, capacity: int, *, words: bool = False) -> None:
         self.capacity, self.evicted = capacity, 0
         self._by_id: dict[int, Entry] = {}
+        self._place: dict[int, int] = {}  # id -> a number that grows in the order of insertion
+        self._places = 0
+        self._oldest: list[
+            tuple[int, int, int]
+        ] = []  # heap of (time, place, id); what has changed since is passed over
+        self._saying: dict[str, dict[int, None]] = {}  # text -> notes that say exactly this
         self._vectors = VectorIndex(embedder)
         self._searched, self._words = words, Lexical() if words else None
 
@@ -96,28 +112,60 @@ class Entries:
 
     def put(self, entry: Entry) -> None:
         """Add a note, or replace the one with its id."""
-        self._by_id[entry.id] = entry
+        self._set(entry)
         self._vectors.put(entry.id, entry.text)
         if self._words is not None:
             self._words.put(entry.id, _words_of(entry))
         while len(self._by_id) > self.capacity:
-            oldest = min(self._by_id.values(), key=lambda e: e.time.total)
-            self.remove(oldest.id)
+            self.remove(self._longest_ago())
             self.evicted += 1
 
     def remove(self, id: int) -> None:
         """Forget a note; one that is not there is ignored."""
-        self._by_id.pop(id, None)
+        entry = self._by_id.pop(id, None)
+        if entry is None:
+            return
+        self._said(entry)
+        del self._place[id]
         self._vectors.remove(id)
         if self._words is not None:
             self._words.remove(id)
 
     def confirm(self, text: str, time: Time) -> bool:
         """Whether a note says exactly `text`; it is then as new as `time`."""
-        same = next((e for e in self._by_id.values() if e.text == text), None)
+        same = min(self._saying.get(text, ()), key=lambda id: self._place[id], default=None)
         if same is not None:
-            self._by_id[same.id] = replace(same, time=time)
+            self._set(replace(self._by_id[same], time=time))
         return same is not None
+
+    def _set(self, entry: Entry) -> None:
+        before = self._by_id.get(entry.id)
+        if before is None:
+            self._places += 1
+            self._place[entry.id] = self._places
+        else:
+            self._said(before)
+        self._by_id[entry.id] = entry
+        self._saying.setdefault(entry.text, {})[entry.id] = None
+        if before is None or before.time.total != entry.time.total:
+            heapq.heappush(self._oldest, (entry.time.total, self._place[entry.id], entry.id))
+            if len(self._oldest) > 2 * len(self._by_id) + 16:  # most of it has changed since
+                self._oldest = [(e.time.total, self._place[e.id], e.id) for e in self]
+                heapq.heapify(self._oldest)
+
+    def _said(self, entry: Entry) -> None:
+        """A note that says so no more."""
+        saying = self._saying[entry.text]
+        del saying[entry.id]
+        if not saying:
+            del self._saying[entry.text]
+
+    def _longest_ago(self) -> int:
+        """The note with the earliest time, of equals the one that was inserted first."""
+        while True:
+            total, place, id = heapq.heappop(self._oldest)
+            if self._place.get(id) == place and self._by_id[id].time.total == total:
+                return id
 
     def near(
         self, query: str, k: int, *, least: float = -1.0, where: Callable[[Entry], bool] | None = None
@@ -151,19 +199,22 @@ class Entries:
         """Cosine similarity of two notes."""
         return float(self._vectors.vector(a) @ self._vectors.vector(b))
 
-    def state(self) -> list[Any]:
-        """JSON-like state; texts, not vectors."""
-        return [self.evicted, [[e.id, e.text, _numbers(e.time), dict(e.data)] for e in self]]
+    def state(self) -> Json:
+        """State as JSON; texts, not vectors."""
+        return joined([self.evicted, joined(e.json for e in self)])
 
     def load(self, state: Sequence[Any]) -> None:
         """Return to `state`."""
         self.evicted, rows = state
-        self._by_id = {id: Entry(id, text, Time(*time), data) for id, text, time, data in rows}
+        self._by_id, self._place, self._places, self._oldest, self._saying = {}, {}, 0, [], {}
+        for row in rows:
+            self._set(Entry.load(row))
         self._vectors.load([(e.id, e.text) for e in self])
         self._words = None
 
 
-def _numbers(time: Time) -> list[int]:
+def numbers(time: Time) -> list[int]:
+    """A time as it is kept in a state."""
     return [time.episode, time.step, time.total]
 
 
@@ -243,6 +294,7 @@ __all__ = [
     "Step",
     "dated",
     "embedder_of",
+    "numbers",
     "one_line",
     "recalled",
     "shown_lines",

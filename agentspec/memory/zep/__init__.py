@@ -53,7 +53,7 @@ from agentspec.memory.zep.temporal import TemporalGraph, normal
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.retrieval import label_propagation
 from agentspec.services import Services, Time
-from agentspec.state import dump_state, load_state
+from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Recall, Task, Transition
@@ -467,7 +467,7 @@ class ZepMemory:
 
     def snapshot(self) -> bytes:
         summaries = [[label, ids, text] for label, (ids, text) in self.summaries.items()]
-        pending = [s.state() for s in self._pending]
+        pending = joined(s.json for s in self._pending)
         flags = [self._waited, self._ended]
         return dump_state([self.graph.state(), list(self.labels.items()), summaries, pending, self._lines, flags])
 

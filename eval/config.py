@@ -1,0 +1,183 @@
+"""A matrix as a YAML file: which policies, in which scaffolds, on which tasks, how.
+
+```yaml
+policies:
+  start: {model: smollm2, adapter: courier}
+  grpo: {model: smollm2, adapters: [runs/s0, runs/s1, runs/s2]}   # training runs of one recipe: one row of the table
+  gpt: {model: some-model, backend: openai, base_url: https://...}
+  rule_based:
+scaffolds:
+  plain: {}
+  react: {reasoning: react, memory: base}
+  sheet: scaffolds/sheet.yaml
+tasks:
+  courier: {env: deliverybench, options: {size: tiny, action_mode: menu}, seeds: 20000-20007}
+  grid: {env: minigrid, seeds: 20000-20007}
+rollouts: 1
+sampling: {temperature: 0}
+limits: {episode_s: 600, cell_tokens: 2000000}
+out: results/matrix
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from agentspec.actions import suggest
+from agentspec.llm.pricing import Price, Prices
+from agentspec.policies import Policy
+from agentspec.registry import SpecError
+from agentspec.spec import AgentSpec
+from agentspec.tasks import parse_seeds
+from agentspec.types import Task
+from eval.cells import Settings
+from eval.limits import Limits
+
+TOP = ("policies", "scaffolds", "tasks", "out", "store", "executor", "workers", "address", "prices", "limits")
+OF_SETTINGS = tuple(f.name for f in fields(Settings) if f.name not in ("prices", "limits"))
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """What `eval.evaluate` is called with.
+
+    Args:
+        arguments: of the call, besides policies, scaffolds and tasks.
+    """
+
+    policies: tuple[Policy, ...]
+    scaffolds: Mapping[str, AgentSpec]
+    tasks: Mapping[str, Sequence[Task]]
+    settings: Settings
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes there are in all."""
+        tasks = sum(map(len, self.tasks.values()))
+        return len(self.policies) * len(self.scaffolds) * tasks * self.settings.rollouts
+
+
+def read_matrix(path: str | Path) -> Matrix:
+    """The matrix of a file; relative paths of adapters, scaffolds and memories are looked up beside it first.
+
+    Raises:
+        SpecError: no such file, or what is wrong in it, by name.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SpecError(f"there is no matrix {path}; give a YAML file with policies, scaffolds and tasks")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise SpecError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    try:
+        return _matrix(_mapping(data, "a matrix"), path.parent)
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}") from error
+
+
+def _matrix(data: Mapping[str, Any], beside: Path) -> Matrix:
+    for name in data:
+        if name not in (*TOP, *OF_SETTINGS):
+            raise SpecError(f"unknown key {name!r}{suggest(str(name), (*TOP, *OF_SETTINGS))}")
+    for name in ("policies", "scaffolds", "tasks"):
+        if not data.get(name):
+            raise SpecError(f"`{name}` is missing: expected a mapping of labels")
+    policies = [
+        p for name, item in _mapping(data["policies"], "policies").items() for p in policy_runs(str(name), item, beside)
+    ]
+    scaffolds = {str(k): _scaffold(v, beside) for k, v in _mapping(data["scaffolds"], "scaffolds").items()}
+    tasks = {str(label): _tasks(str(label), item) for label, item in _mapping(data["tasks"], "tasks").items()}
+    given: dict[str, Any] = {name: data[name] for name in OF_SETTINGS if name in data}
+    given["limits"] = Limits.from_data(_mapping(data.get("limits") or {}, "limits"))
+    given["prices"] = _prices(data.get("prices"), beside)
+    if isinstance(start := given.get("start_memory"), str):
+        given["start_memory"] = _beside(start, beside)
+    elif start:
+        given["start_memory"] = {k: _beside(v, beside) for k, v in _mapping(start, "start_memory").items()}
+    try:
+        settings = Settings(**given)
+    except TypeError as error:
+        raise SpecError(f"a setting has a value of the wrong kind: {error}") from error
+    arguments = {name: data[name] for name in ("out", "store", "executor", "workers", "address") if name in data}
+    return Matrix(tuple(policies), scaffolds, tasks, settings, arguments)
+
+
+def policy_runs(name: str, item: Any, beside: Path) -> list[Policy]:
+    """One policy, or one for each of its training runs (`adapters`, a list or a mapping of run names).
+
+    Raises:
+        SpecError: neither a scripted policy nor one with a model.
+    """
+    if item is None or item == {}:
+        return [Policy.parse(name)]
+    if isinstance(item, str):
+        item = {"model": item}
+    settings = dict(_mapping(item, f"policy {name!r}"))
+    runs, adapter = settings.pop("adapters", None), settings.pop("adapter", "")
+    model = settings.pop("model", "")
+    if not model and "script" not in settings:
+        raise SpecError(f"policy {name!r}: `model` is missing (a folder, a bundled name or a hub id)")
+    model = _beside(str(model), beside)
+    if runs is None:
+        return [Policy(name, model, _adapter(str(adapter), beside), settings)]
+    if adapter or not runs or not isinstance(runs, list | dict):
+        raise SpecError(f"policy {name!r}: `adapters` is a list of folders, one per training run, without `adapter`")
+    named = runs if isinstance(runs, dict) else {str(i): folder for i, folder in enumerate(runs)}
+    return [Policy(name, model, _adapter(str(f), beside), settings, run=str(run)) for run, f in named.items()]
+
+
+def _adapter(text: str, beside: Path) -> str:
+    """A folder, or the name of an adapter that comes with the package."""
+    if not text:
+        return ""
+    from agentspec.llm.models import resolve_adapter
+
+    return str(resolve_adapter(_beside(text, beside)))
+
+
+def _scaffold(item: Any, beside: Path) -> AgentSpec:
+    if isinstance(item, str):
+        return AgentSpec.from_yaml(_beside(item, beside))
+    return AgentSpec.from_data(item or {})
+
+
+def _tasks(label: str, item: Any) -> list[Task]:
+    data = _mapping(item, f"tasks {label!r}")
+    for name in data:
+        if name not in ("env", "options", "seeds", "split"):
+            raise SpecError(f"tasks {label!r}: unknown key {name!r}{suggest(str(name), ('env', 'options', 'seeds'))}")
+    if not isinstance(data.get("env"), str):
+        raise SpecError(f"tasks {label!r}: `env` is missing (a registered name or gymnasium id)")
+    seeds = data.get("seeds", "20000-20007")
+    texts = [str(seed) for seed in seeds] if isinstance(seeds, list) else [str(seeds)]
+    options = dict(_mapping(data.get("options") or {}, f"options of tasks {label!r}"))
+    return [Task(data["env"], seed, options, str(data.get("split", "test"))) for seed in parse_seeds(texts)]
+
+
+def _prices(item: Any, beside: Path) -> Prices:
+    if item is None:
+        return Prices()
+    if isinstance(item, str):
+        return Prices.from_yaml(_beside(item, beside))
+    try:
+        return Prices({str(name): Price(**value) for name, value in _mapping(item, "prices").items()})
+    except TypeError as error:
+        raise SpecError(f"prices: {error}; expected {{model: {{input, output, cached}}}} in $ per million") from error
+
+
+def _beside(text: str, folder: Path) -> str:
+    return str(folder / text) if text and (folder / text).exists() else text
+
+
+def _mapping(value: Any, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise SpecError(f"expected {what} as a mapping, got {type(value).__name__}")
+    return value

@@ -1,0 +1,257 @@
+"""Failures of a matrix: which kinds, how often, per scaffold and beside the paper's shares.
+
+The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`); how
+far to believe it is measured as Cohen's kappa against a labelled sample (`data/failure_labels.jsonl`, whose first line
+says who read it and how), and the rules' precision and recall against the same sample.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from agentspec.actions import parse_action
+from agentspec.episode import make_env
+from agentspec.failures import LEAVES, Sign, is_failure, leading, signs
+from agentspec.files import jsonable
+from agentspec.llm.base import LLM, Message, Request
+from agentspec.perception.generic import GenericPerception
+from agentspec.simulator import OBJECTS_IN_INFO
+from agentspec.structured import ParseError, json_of
+from agentspec.trajectory import Trajectory
+from agentspec.types import ActionError, CallTag, Decision, Sampling, Task, Transition
+
+OPEN = "open"
+"""Failures that no rule explains and nobody judged."""
+LABELS = Path(__file__).with_name("data") / "failure_labels.jsonl"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is known of one episode.
+
+    Args:
+        failed: `None` where it could not be played to its end.
+        leaf: leading kind of failure; `open` without one; empty for a success.
+        judged: whether a model chose it.
+    """
+
+    failed: bool | None
+    leaf: str
+    signs: tuple[Sign, ...] = ()
+    judged: bool = False
+
+
+def diagnose(trajectory: Trajectory, judge: Judge | None = None) -> Diagnosis:
+    """The leading kind of failure of an episode, by rules, and by the judge where they are silent."""
+    failed = is_failure(trajectory)
+    found = tuple(signs(trajectory)) if failed is not None else ()
+    if not failed:
+        return Diagnosis(failed, "", found)
+    if leaf := leading(found):
+        return Diagnosis(True, leaf, found)
+    judged = judge.ask(trajectory) if judge else ""
+    return Diagnosis(True, judged or OPEN, found, bool(judged))
+
+
+@dataclass
+class Shares:
+    """Counts of one group of episodes (a scaffold, a world)."""
+
+    episodes: int = 0
+    failed: int = 0
+    leaves: Counter[str] = field(default_factory=Counter)
+    signs: Counter[str] = field(default_factory=Counter)
+
+    def add(self, diagnosis: Diagnosis) -> None:
+        """Count an episode that was played to its end."""
+        if diagnosis.failed is None:
+            return
+        self.episodes += 1
+        self.failed += diagnosis.failed
+        if diagnosis.failed:
+            self.leaves[diagnosis.leaf] += 1
+        self.signs.update({sign.leaf for sign in diagnosis.signs})
+
+    def share(self, leaf: str) -> float:
+        """Of all failures, the share that this kind leads."""
+        return self.leaves[leaf] / self.failed if self.failed else 0.0
+
+
+def by_scaffold(diagnosed: Iterable[tuple[str, str, Diagnosis]]) -> dict[tuple[str, str], Shares]:
+    """(world, scaffold) -> counts, from (world, scaffold, diagnosis) of episodes."""
+    found: dict[tuple[str, str], Shares] = {}
+    for world, scaffold, diagnosis in diagnosed:
+        found.setdefault((world, scaffold), Shares()).add(diagnosis)
+    return found
+
+
+def paper_shares(world: str) -> dict[str, float]:
+    """Leaf -> share of failures (0 to 1) as the paper prints it for a world; empty for worlds that it has not."""
+    from eval.paper import numbers
+
+    prefix = "failure_share_percent/"
+    rows = [n for n in numbers() if n.table == "failure_taxonomy" and n.environment == world]
+    return {n.metric.removeprefix(prefix): n.value / 100 for n in rows}
+
+
+# -- a model as judge ------------------------------------------------------------------------------
+
+INSTRUCTION = """You judge why an agent failed in a text world. Choose the one kind of failure that explains most of it:
+{kinds}
+Answer with JSON only: {{"kind": "<one of the names above>", "why": "<one sentence>"}}"""
+
+
+class Judge:
+    """Asks a model for the kind of a failure.
+
+    Args:
+        llm: backend.
+        steps: most steps of an episode that are shown: the first two, and the last.
+        characters: most of each observation.
+    """
+
+    def __init__(self, llm: LLM, *, steps: int = 16, characters: int = 400) -> None:
+        self.llm, self.steps, self.characters = llm, steps, characters
+        self.asked = self.unreadable = 0
+
+    def ask(self, trajectory: Trajectory) -> str:
+        """A key of `LEAVES`, or empty where the answer could not be read."""
+        return asyncio.run(self.ask_async(trajectory))
+
+    async def ask_async(self, trajectory: Trajectory) -> str:
+        """As `ask`, inside a running loop."""
+        self.asked += 1
+        kinds = "\n".join(f"- {name}: {what}" for name, what in LEAVES.items())
+        messages = (
+            Message("system", (INSTRUCTION.format(kinds=kinds),)),
+            Message("user", (self.show(trajectory),)),
+        )
+        tag = CallTag("eval.failures", "judge", trajectory.task.key)
+        sampling = Sampling(temperature=0.0, max_tokens=256)
+        call = await self.llm.generate(Request(messages, sampling, tag, id=self.asked))
+        leaf = read_kind(call.text)
+        self.unreadable += not leaf
+        return leaf
+
+    def show(self, trajectory: Trajectory) -> str:
+        """The episode as the judge sees it."""
+        steps = trajectory.transitions
+        shown = [*steps[:2], *steps[max(2, len(steps) - self.steps + 2) :]]
+        lines = [steps[0].input.instruction[:2000] if steps else "", ""]
+        for before, t in zip([None, *shown], shown, strict=False):
+            if before is not None and t.step > before.step + 1:
+                lines.append(f"[{t.step - before.step - 1} steps left out]")
+            lines.append(f"Step {t.step}. Saw: {t.input.text[-self.characters :]}")
+            lines.append(f"Did: {t.action_text[:200]}")
+            outcome = t.info.get("error") or t.info.get("message") or ""
+            lines.append(f"Outcome: {outcome}")
+        figures = {k: v for k, v in trajectory.metrics.items() if isinstance(v, int | float)}
+        return "\n".join([*lines, "", f"End: {json.dumps(dict(list(figures.items())[:12]))}"])
+
+
+def read_kind(text: str) -> str:
+    """The kind that an answer names: by its JSON, else where it names exactly one; empty otherwise.
+
+    >>> read_kind('{"kind": "grounding/spatial/stuck", "why": "..."}')
+    'grounding/spatial/stuck'
+    """
+    try:
+        kind = json_of({"kind": str})(text)["kind"]
+    except ParseError:
+        kind = ""
+    if kind in LEAVES:
+        return str(kind)
+    named = [leaf for leaf in LEAVES if leaf in text]
+    return named[0] if len(named) == 1 else ""
+
+
+# -- how far to believe it -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Of one kind: how many were labelled so, how many were said to be, and in how many both."""
+
+    labelled: int
+    said: int
+    both: int
+
+    @property
+    def precision(self) -> float | None:
+        """Of those said, the share that is labelled so."""
+        return self.both / self.said if self.said else None
+
+    @property
+    def recall(self) -> float | None:
+        """Of those labelled, the share that is said."""
+        return self.both / self.labelled if self.labelled else None
+
+
+def agreement(labels: Sequence[str], said: Sequence[str]) -> dict[str, Agreement]:
+    """Per kind, and over all kinds under `all` (an open answer is said of none)."""
+    kinds = [leaf for leaf in LEAVES if leaf in {*labels, *said}]
+    found = {
+        leaf: Agreement(
+            sum(label == leaf for label in labels),
+            sum(answer == leaf for answer in said),
+            sum(label == answer == leaf for label, answer in zip(labels, said, strict=True)),
+        )
+        for leaf in kinds
+    }
+    whole = Agreement(len(labels), sum(a.said for a in found.values()), sum(a.both for a in found.values()))
+    return found | {"all": whole}
+
+
+def kappa(a: Sequence[str], b: Sequence[str]) -> float:
+    """Cohen's kappa of two raters: agreement beyond what their own frequencies would give by chance.
+
+    >>> kappa(["x", "x", "y", "y"], ["x", "x", "y", "x"])
+    0.5
+
+    Raises:
+        ValueError: nothing rated, or lists of different lengths.
+    """
+    if not a or len(a) != len(b):
+        raise ValueError(f"expected two ratings of the same items, got {len(a)} and {len(b)}")
+    observed = sum(x == y for x, y in zip(a, b, strict=True)) / len(a)
+    expected = sum(a.count(kind) * b.count(kind) for kind in {*a, *b}) / len(a) ** 2
+    return 1.0 if expected == 1 else (observed - expected) / (1 - expected)
+
+
+def read_labels(path: Path = LABELS) -> list[dict[str, Any]]:
+    """The labelled sample: `{"task": {...}, "actions": [...], "label": leaf, "why": ...}` per line after the first.
+
+    An episode is kept as the texts that were executed; `replayed` plays them again.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()[1:]
+    return [json.loads(line) for line in lines if line.strip()]
+
+
+def replayed(task: Task, actions: Sequence[str]) -> Trajectory:
+    """The episode in which these texts were executed, one per step, to the end of the texts or of the episode."""
+    env, perception = make_env(task), GenericPerception()
+    observation, info = env.reset(seed=task.seed)
+    steps: list[Transition] = []
+    for text in actions:
+        shown = perception.perceive(task, observation, info)
+        action = parse_action(text, info["action_schema"])
+        observation, reward, terminated, truncated, info = env.step(text)
+        report = {k: jsonable(v) for k, v in info.items() if k not in OBJECTS_IN_INFO}
+        decision = Decision(action, valid=not isinstance(action, ActionError))
+        seen = str(observation["text"])
+        steps.append(
+            Transition(
+                len(steps), shown, decision, text, float(reward), seen, bool(terminated), bool(truncated), report
+            )
+        )
+        if terminated or truncated:
+            break
+    env.close()
+    metrics = {**jsonable(info.get("metrics", {})), "return": sum(t.reward for t in steps), "steps": len(steps)}
+    return Trajectory(task, {}, transitions=tuple(steps), metrics=metrics)

@@ -1,0 +1,108 @@
+"""Kinds of failure: what the rules find in played episodes, the judge's answers, agreement with labels."""
+
+from __future__ import annotations
+
+import pytest
+
+from agentspec.failures import LEAVES, Sign, in_a_row, is_failure, leading, revisits, signs
+from agentspec.llm.base import Request
+from agentspec.llm.scripted import ScriptedLLM
+from agentspec.types import Task
+from eval.failures import Agreement, Judge, agreement, by_scaffold, diagnose, kappa, paper_shares, read_kind, replayed
+
+FETCH = Task("minigrid", 0, {"level": "MiniGrid-Fetch-5x5-N2-v0"})
+GOTO = Task("minigrid", 0, {"level": "MiniGrid-GoToObject-6x6-N2-v0"})
+EMPTY = Task("minigrid", 0, {"level": "MiniGrid-Empty-6x6-v0"})
+COURIER = Task("deliverybench", 0, {"size": "tiny", "shift_hours": 1.0})
+
+
+def leaves(task: Task, *actions: str) -> list[tuple[str, int]]:
+    return [(sign.leaf, sign.step) for sign in signs(replayed(task, actions))]
+
+
+def test_texts_that_are_no_action() -> None:
+    found = leaves(COURIER, "FLY()", "MOVE(x='far')", "VIEW_ORDERS()")
+    assert found == [("parse/action_interface/hallucination", 0), ("parse/action_interface/parameter", 1)]
+    first = replayed(EMPTY, ["TURN_LEFT()"]).transitions[0]
+    assert leaves(EMPTY, "TURN_LEFT()", first.next_text[:300])[-1] == ("parse/unstructured_memory", 1)
+
+
+def test_an_action_that_fails_again_for_the_same_reason() -> None:
+    wrong = "DROP_OFF(0, 'hand_to_customer')"
+    kind = "understanding/state_confusion/{}"
+    assert (kind.format("history_misunderstood"), 1) in leaves(COURIER, wrong, wrong)
+    between = [f"WAIT({10 + i})" for i in range(9)]
+    assert (kind.format("missing_history"), 10) in leaves(COURIER, wrong, *between, wrong)
+    assert not any("state_confusion" in leaf for leaf, _ in leaves(COURIER, wrong))
+
+
+def test_running_into_walls_and_in_circles() -> None:
+    found = leaves(EMPTY, *["FORWARD()"] * 8)  # 6x6: three steps to the wall, then it is in the way
+    assert found == [("grounding/spatial/stuck", step) for step in (4, 5, 6, 7)] or found[0][1] >= 4
+    circles = leaves(EMPTY, *["TURN_LEFT()"] * 12)  # each of four views is seen for the third time from step 8 on
+    assert circles == [("grounding/spatial/stuck", step) for step in (8, 9, 10, 11)]
+
+
+def test_acting_on_nothing_and_saying_done_elsewhere() -> None:
+    assert leaves(EMPTY, "PICK_UP()") == [("grounding/object/hallucination", 0)]
+    [(leaf, step)] = leaves(GOTO, "DONE()") or [("", 0)]
+    assert leaf in ("grounding/spatial/distance", "grounding/object/hallucination") and step == 0
+
+
+def test_money_and_time_misjudged() -> None:
+    episode = replayed(COURIER, ["VIEW_ORDERS()", "VIEW_ORDERS()"])
+    assert [s.leaf for s in signs(episode)] == ["understanding/state_confusion/history_misunderstood"]
+    assert [s.leaf for s in signs(replayed(COURIER, ["WAIT(600)"]))] == ["understanding/knowledge/strategy"]
+
+
+def test_the_leading_kind_and_the_diagnosis() -> None:
+    stuck, done = "grounding/spatial/stuck", "grounding/spatial/distance"
+    found = [Sign(done, 0, ""), Sign(stuck, 1, ""), Sign(stuck, 1, "again"), Sign(stuck, 2, "")]
+    assert leading(found) == stuck and leading([]) == ""
+    episode = replayed(EMPTY, ["TURN_LEFT()"] * 100)
+    assert is_failure(episode) and diagnose(episode).leaf == stuck
+    with pytest.raises(ValueError, match="unknown kind"):
+        Sign("spatial", 0, "")
+
+
+def test_a_judge_decides_what_the_rules_leave_open() -> None:
+    seen: list[str] = []
+
+    def answer(request: Request) -> str:
+        seen.append("".join(str(part) for m in request.messages for part in m.content))
+        return '```json\n{"kind": "understanding/knowledge/strategy", "why": "it never looks for the goal"}\n```'
+
+    episode = replayed(EMPTY, ["TURN_LEFT()", "FORWARD()"])
+    assert diagnose(episode).leaf == "open"
+    judged = diagnose(episode, Judge(ScriptedLLM(answer)))
+    assert (judged.leaf, judged.judged) == ("understanding/knowledge/strategy", True)
+    assert all(leaf in seen[0] for leaf in LEAVES) and "Did: FORWARD()" in seen[0]
+    lost = Judge(ScriptedLLM(["no idea"]))
+    assert diagnose(episode, lost).leaf == "open" and lost.unreadable == 1
+    assert read_kind("I would say grounding/spatial/stuck.") == "grounding/spatial/stuck"
+    assert read_kind("grounding/spatial/stuck or grounding/spatial/distance") == ""
+
+
+def test_shares_per_scaffold_count_failures_only() -> None:
+    stuck = diagnose(replayed(EMPTY, ["TURN_LEFT()"] * 100))
+    found = by_scaffold([("minigrid", "plain", stuck), ("minigrid", "plain", stuck)])
+    shares = found["minigrid", "plain"]
+    assert (shares.episodes, shares.failed, shares.share("grounding/spatial/stuck")) == (2, 2, 1.0)
+    assert sum(paper_shares("minigrid").values()) == pytest.approx(1.0, abs=0.01)
+    assert paper_shares("minigrid").keys() == set(LEAVES) and paper_shares("elsewhere") == {}
+
+
+def test_agreement_by_hand() -> None:
+    a, b = "grounding/spatial/stuck", "grounding/spatial/distance"
+    found = agreement([a, a, b], [a, b, "open"])
+    assert found[a] == Agreement(2, 1, 1) and (found[a].precision, found[a].recall) == (1.0, 0.5)
+    assert found[b] == Agreement(1, 1, 0) and found["all"] == Agreement(3, 2, 1)
+    # Agreement 3 of 4; by chance (2 * 3 + 2 * 1) / 16: (.75 - .5) / (1 - .5).
+    assert kappa(["x", "x", "y", "y"], ["x", "x", "y", "x"]) == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="same items"):
+        kappa(["x"], [])
+
+
+def test_positions() -> None:
+    assert list(revisits("abaaa")) == [3, 4]
+    assert list(in_a_row([True, True, True, False, True])) == [1, 2]

@@ -1,0 +1,112 @@
+"""Reports: what stands in them, in every form, from a played matrix."""
+
+from __future__ import annotations
+
+import csv
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from agentspec.cli import main
+from agentspec.llm.base import Request
+from agentspec.llm.scripted import ScriptedLLM
+from agentspec.policies import Policy
+from agentspec.spec import AgentSpec
+from agentspec.types import Task
+from eval.matrix import evaluate
+from eval.report import build_report, write_files
+from eval.report.blocks import Figure, Table, to_html, to_latex
+from eval.report.figures import pareto_front
+from tests.toy_env import TOY
+
+SPECS = {
+    f"{reasoning}+{memory}": AgentSpec.from_data({"reasoning": reasoning, "memory": memory, "layout": "snapshot"})
+    for reasoning in ("direct", "react")
+    for memory in ("none", "base")
+} | {"reflecting": AgentSpec.from_data({"reasoning": "direct", "reflection": "self_refine"})}
+
+
+def trader(request: Request) -> str:
+    """Sells always, or with a memory only now and then: scaffolds differ."""
+    text = "".join(str(part) for message in request.messages for part in message.content)
+    return "SELL()" if "Earlier" not in text and len(text) % 3 else "WAIT()"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("matrix")
+    policies = [Policy("random"), *(Policy("trader", f"t{i}", run=str(i)) for i in range(3))]
+    tasks = {
+        "toy": [Task(TOY, s) for s in range(4)],
+        "grid": [Task("minigrid", s, {"action_mode": "menu"}) for s in (0, 1)],
+    }
+
+    def make(policy: Policy) -> ScriptedLLM | None:
+        return None if policy.scripted else ScriptedLLM(lambda r: "turn left" if r.sampling.choices else trader(r))
+
+    evaluate(policies, SPECS, tasks, out=out, make_llm=make, trajectories=True, max_steps=12)
+    return out
+
+
+def test_a_report_has_its_sections_and_says_what_its_numbers_are(folder: Path) -> None:
+    report = build_report(folder, title="Toy", paper=True)
+    text = to_html(report.blocks, "Toy")
+    for heading in ("toy: policy x scaffold", "reasoning x memory", "reflection", "what it costs", "Failures", "Costs"):
+        assert heading in text, heading
+    captions = [b.caption for b in report.blocks if isinstance(b, Table | Figure)]
+    assert any("n = 4 tasks x 1 repeats of up to 3 training runs; 95% t intervals" in c for c in captions)
+    assert all(caption.strip() for caption in captions)
+    # What was read is named by its digest.
+    assert "results.jsonl" in text and "SHA-256" in text
+
+
+def test_every_form_is_written_and_well_formed(folder: Path, tmp_path: Path) -> None:
+    report = build_report(folder)
+    written = write_files(report, tmp_path)
+    names = {path.relative_to(tmp_path).as_posix() for path in written}
+    assert {"report.html", "report.md", "report.tex", "episodes.csv"} <= names
+    page = (tmp_path / "report.html").read_text()
+    assert "<script" not in page and "http://" not in page.replace("http://www.w3.org", "").replace(
+        "http://purl", ""
+    ).replace("http://creativecommons", "")
+    for path in written:
+        if path.suffix == ".svg":
+            ET.parse(path)
+    rows = list(csv.DictReader((tmp_path / "episodes.csv").open()))
+    assert len(rows) == len(report.rows) and rows[0]["agent_reasoning"]
+    pictures = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("![")]
+    assert pictures and all((tmp_path / line.split("](")[1].rstrip(")")).is_file() for line in pictures)
+
+
+def test_the_same_rows_give_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_files(build_report(folder), tmp_path / name)
+    for path in sorted((tmp_path / "a").rglob("*.*")):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes(), path.name
+
+
+def test_latex_escapes_what_it_must() -> None:
+    text = to_latex([Table(["a_b", "$/h"], [["50 % & more", "x^2 #1"]], "n < 3")])
+    assert r"a\_b & \$/h \\" in text and r"50 \% \& more & x\textasciicircum{}2 \#1 \\" in text
+    assert r"\caption{n \textless{} 3}" in text
+
+
+def test_who_is_on_the_front() -> None:
+    # (cost, value): the third costs more than the second and gives less; equals are both on it.
+    assert pareto_front([(1, 1), (2, 3), (3, 2), (2, 3)]) == [0, 1, 3]
+
+
+def test_from_the_command_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "run" / "metrics.jsonl"
+    log.parent.mkdir()
+    log.write_text("".join(json.dumps({"step": s, "reward": float(s)}) + "\n" for s in range(3)))
+    command = ["report", str(folder), "--to", str(tmp_path / "out"), "--runs", f"grpo={log.parent}"]
+    assert main(command) == 0
+    assert "report.html" in capsys.readouterr().out
+    assert "Learning curves" in (tmp_path / "out" / "report.html").read_text()
+    with pytest.raises(SystemExit) as end:
+        main(["report", str(tmp_path / "nowhere"), "--to", str(tmp_path / "x")])
+    assert end.value.code == 2
+    assert "give the folder of an evaluation" in capsys.readouterr().err
