@@ -33,10 +33,7 @@ class EstimatorSpec:
     """One row of the table.
 
     Args:
-        name: as in `estimator: NAME`.
         function: per episode: returns (n,) -> advantages (n,); per step: rewards, ragged (n, steps) -> the same shape.
-        summary: what it does, in one line.
-        per_step: whether it gives one advantage per step.
         zero_sum: whether the advantages of a group sum to zero (what an audit may expect of an honest run).
         needs: keyword arguments of `function` that come from the configuration (`gamma`, `gigpo_weight`) or from the
             episodes (`anchors`: per rollout and step the state in which the action was taken).

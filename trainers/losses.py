@@ -76,10 +76,7 @@ class LossSpec:
     """One row of the table.
 
     Args:
-        name: as in `loss_type: NAME`.
-        summary: the loss of an update, in one line.
         trl: TRL's `loss_type` whose code computes it; empty where `objective` does.
-        objective: ours: see `Objective`.
         denominator: what the sum over the update is divided by, where it is one number.
         clipped: which tokens lose their gradient to clipping; arguments as of `objective`.
         uses: settings of the configuration that it reads.

@@ -26,6 +26,7 @@ from trainers.credit import ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.retroformer import as_retroformer
 from trainers.rollouts import rollout_jobs, starting_states, task_rows
+from trainers.run_folder import last_complete_checkpoint
 from trainers.runlog import RunLog
 
 TASKS = [Task(TOY, seed, {"steps": 3, "menu": True}) for seed in range(2)]
@@ -112,6 +113,7 @@ def test_a_resumed_run_has_the_memories_of_its_checkpoint_until_it_writes_others
     with again._recorded(str(tmp_path / "checkpoint-1")):
         assert digest((tmp_path / FILE).read_bytes()) == receipts[0]["chain"]["memory"]
         assert [v for r in audit(tmp_path) for v in r.violations] == []
+        assert last_complete_checkpoint(tmp_path) == tmp_path / "checkpoint-1"  # not one whose records are gone
     (tmp_path / FILE).unlink()
     assert any(FILE in v for r in audit(tmp_path) for v in r.violations)
 
