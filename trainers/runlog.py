@@ -37,18 +37,9 @@ from agentspec.files import (
 )
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, versions
+from trainers import run_folder
 from trainers.digests import field_digests
-from trainers.run_folder import (
-    EVALUATIONS,
-    MANIFEST,
-    MANIFESTS,
-    METRICS,
-    SEAL,
-    STATE,
-    TRAJECTORIES,
-    UPDATES,
-    checkpoints,
-)
+from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
 
 FORMAT = 4
 SEALED = (MANIFEST, UPDATES, MEMORY, METRICS, EVALUATIONS)
@@ -154,9 +145,9 @@ class RunLog:
         for path in round_files(self.folder):
             if int(path.name[:6]) >= step:
                 path.unlink()
-        for path in checkpoints(self.folder):
+        for path in run_folder.checkpoints(self.folder):
             if int(path.name.rpartition("-")[2]) > step:
-                (path / STATE).unlink()  # without its records nobody may go on from it
+                (path / run_folder.STATE).unlink()  # without its records nobody may go on from it
 
 
 def round_files(folder: Path) -> list[Path]:
