@@ -1,16 +1,16 @@
 """One step of the agent: perceive, recall, reason, revise; then learn what came of it.
 
 The agent owns the order of things and nothing else. It credits the calls that produced the executed action, writes the
-assistant's turn into the context and turns an exhausted budget into a flagged decision instead of a crash. What a
-memory or a reflector cannot do (its prompt is too long for the model, the budget is used up) is a counted no-op: the
-episode goes on without it.
+assistant's turn into the context, keeps the plan that an answer carried for the next prompt, and turns an exhausted
+budget into a flagged decision instead of a crash. What a memory or a reflector cannot do (its prompt is too long for
+the model, the budget is used up) is a counted no-op: the episode goes on without it.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Awaitable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from agentspec.context import Context
@@ -19,7 +19,7 @@ from agentspec.llm.pictures import picture
 from agentspec.llm.recorder import BudgetExceededError, Recorder
 from agentspec.protocols import Measured, Memory, Perception, Reasoning, Reflection, Services, Simulator, StepClock
 from agentspec.state import dump_state, load_state
-from agentspec.types import ActionError, AgentInput, Decision, LLMCall, Recall, Task, Transition
+from agentspec.types import Action, ActionError, AgentInput, Decision, LLMCall, Recall, Task, Transition
 
 if TYPE_CHECKING:
     from agentspec.trajectory import Trajectory
@@ -78,6 +78,10 @@ class Agent:
         for call_id, completion in decision.calls:
             self.recorder.credit(call_id, completion, "executed")
         self.context.close(decision.turn or (decision.action.text,))
+        plan = decision.action.plan if isinstance(decision.action, Action) else ""
+        if plan:
+            self.context.plan = plan
+            decision = replace(decision, trace={"plan": plan, **decision.trace})
         return agent_input, decision
 
     async def learn(self, transition: Transition) -> None:

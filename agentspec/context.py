@@ -17,6 +17,7 @@ from dataclasses import asdict
 from typing import Any, Literal
 
 from agentspec.llm.base import Message, assistant, system, user
+from agentspec.shapes import plan_of
 from agentspec.state import dump_state, load_state
 from agentspec.tokens import CountTokens, estimate_tokens
 from agentspec.types import Part, Picture, Recall, Sampled
@@ -26,6 +27,7 @@ Placement = Literal["newest", "kept"]
 
 LESSONS = "Lessons from earlier trials:\n{text}"
 MEMORY = "Memory:\n{text}"
+PLAN = "Your last plan: {text}"
 
 
 class Context:
@@ -64,6 +66,8 @@ class Context:
         self.lesson_tokens = lesson_tokens
         self.window = window
         self.carry = ""
+        self.plan = ""
+        """What the agent last wrote into an answer as its plan."""
         self.pictures: tuple[Picture, ...] = ()
         """What the current step sees: part of its prompts, and of nothing that is kept."""
         self._count = count_tokens
@@ -75,14 +79,15 @@ class Context:
         self._recalled: list[str] = []  # its blocks
 
     def recalled(self, recall: Recall) -> str:
-        """What `recall` adds in front of this step's observation: lessons, then memories, each within its budget.
+        """What `recall` adds in front of this step's observation: lessons, then memories, each within its budget, and
+        the agent's last plan, unless the conversation still holds it.
 
         Every block ends in an empty line; nothing recalled is the empty string. Write it into the user turn of the
         step's prompts: it is taken out of the conversation again where `recall="newest"`.
         """
         lessons = recall.lessons.render(self.lesson_tokens, self._count)
         memories = recall.memories.render(self.recall_tokens, self._count)
-        blocks = ((LESSONS, lessons), (MEMORY, memories))
+        blocks = ((LESSONS, lessons), (MEMORY, memories), (PLAN, "" if self._holds_plan() else self.plan))
         text = "".join(f"{block.format(text=shown)}\n\n" for block, shown in blocks if shown)
         if text and text not in self._recalled:
             self._recalled.append(text)
@@ -96,8 +101,8 @@ class Context:
         self._static = static
         if self.layout == "snapshot":
             self._forget_turns(0)
-        elif self.max_turns and not self._running and len(self._turns) >= 2 * self.max_turns:
-            self._forget_turns(2 * (self.max_turns // 2) if self.max_turns > 1 else 0)
+        elif not self._running:
+            self._forget_turns(self._left())
         if not self._running or not self._steps:
             self._steps.append(len(self._turns))
         self._running = True
@@ -136,6 +141,14 @@ class Context:
     def steps(self) -> int:
         """Number of steps whose turns the conversation holds."""
         return len(self._steps) - self._running
+
+    @property
+    def told(self) -> int:
+        """How many of the newest steps the turns of the next step's prompt tell (0 in `snapshot`)."""
+        if self.layout == "snapshot":
+            return 0
+        gone = len(self._turns) - self._left()
+        return sum(start >= gone for start in self._steps) - self._running
 
     def older(self, keep: int) -> tuple[Message, ...]:
         """The turns of all steps but the newest `keep`: what `evict` would forget."""
@@ -178,6 +191,7 @@ class Context:
             {
                 "static": self._static,
                 "carry": self.carry,
+                "plan": self.plan,
                 "turns": turns,
                 "steps": self._steps,
                 "open": opened,
@@ -189,7 +203,7 @@ class Context:
     def restore(self, blob: bytes) -> None:
         """Return to a snapshot."""
         data = load_state(blob)
-        self._static, self.carry = data["static"], data["carry"]
+        self._static, self.carry, self.plan = data["static"], data["carry"], data["plan"]
         self._turns = [Message(t["role"], tuple(_part_from_json(p) for p in t["content"])) for t in data["turns"]]
         self._steps, self._running, self._recalled = data["steps"], data["running"], data["recalled"]
         self._open = None if data["open"] is None else user(data["open"])
@@ -203,6 +217,18 @@ class Context:
             first = self._steps[-1]
             turns[first] = user(turns[first].text, *self.pictures)
         return (system(self._static), *turns)
+
+    def _holds_plan(self) -> bool:
+        """Whether a turn that the next prompt keeps says the plan as it is now."""
+        kept = self._turns[len(self._turns) - self._left() :] if self.plan and self.layout == "conversation" else []
+        said = (plan_of(m.text) if m.role == "assistant" else m.text for m in kept)
+        return any(text == self.plan or PLAN.format(text=self.plan) in text for text in said)
+
+    def _left(self) -> int:
+        """How many of the turns the next step's prompt begins with: all, or the newest where it starts over."""
+        if not self.max_turns or len(self._turns) < 2 * self.max_turns:
+            return len(self._turns)
+        return 2 * (self.max_turns // 2) if self.max_turns > 1 else 0
 
     def _start(self, keep: int) -> int:
         """At which turn the newest `keep` steps begin."""

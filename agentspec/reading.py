@@ -18,7 +18,7 @@ to an environment executes nothing.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from agentspec import literals, shapes
 from agentspec.literals import known_name, scan_call
@@ -74,7 +74,8 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     plain = undressed(_bounded(shown))
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
     if isinstance(reading.action, Action):
-        return reading
+        plan = shapes.plan_of(_bounded(shown))
+        return replace(reading, action=replace(reading.action, plan=plan)) if plan else reading
     error = reading.action
     if (cut or open_block) and error.code not in ("PARSE_UNKNOWN", "PARSE_ARGS"):
         message = "the answer was cut off before its action; write less, and the action first"

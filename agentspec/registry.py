@@ -106,6 +106,7 @@ class Entry:
             "calls": asdict(self.calls),
             "purposes": list(self.purposes),
             "needs": list(self.needs),
+            "extra": self.declaration.extra,
             "presets": {name: asdict(profile) for name, profile in self.presets.items()},
             "aliases": list(self.declaration.aliases),
             "target": self.target,

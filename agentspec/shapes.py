@@ -42,6 +42,9 @@ ARGUMENTS = (
     "input",
 )
 THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "analysis", "reason")
+PLANS = ("plan", "future_plan")
+MAX_PLAN = 500
+"""Signs of a plan that are kept."""
 MOST_OBJECTS = 16
 """Opening brackets that are tried before a text is taken to hold no data."""
 
@@ -81,6 +84,24 @@ def find_shape(text: str, schema: ActionSchema, start: int = 0) -> Shape | None:
         if found is not None:
             return Shape(found, at, _thought(data))
     return tagged
+
+
+def plan_of(text: str) -> str:
+    """The plan beside an action, as in `{"action": "WAIT(60)", "plan": "then fetch order 3"}`; "" where there is none.
+
+    `future_plan`, as DeliveryBench's own answers call it, and a list of steps will do.
+    """
+    start, end = text.find("{"), text.rfind("}")
+    if not 0 <= start < end or not any(f'"{key}"' in text for key in PLANS):
+        return ""
+    try:
+        data = json.loads(text[start : end + 1])
+    except (ValueError, RecursionError):
+        return ""
+    plan = next((data[key] for key in PLANS if data.get(key)), "") if isinstance(data, dict) else ""
+    if isinstance(plan, list):
+        plan = "; ".join(step for step in plan if isinstance(step, str))
+    return " ".join(plan.split())[:MAX_PLAN] if isinstance(plan, str) else ""
 
 
 def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | None:

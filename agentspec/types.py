@@ -164,12 +164,16 @@ MIN_CLIPPED = 8
 
 @dataclass(frozen=True)
 class Action:
-    """A parsed action: canonical name, positional and keyword arguments (units applied), and the text it came from."""
+    """A parsed action: canonical name, positional and keyword arguments (units applied), and the text it came from.
+
+    `plan` is what an answer in JSON said beside it about what comes next; it is no part of what is done.
+    """
 
     name: str
     args: tuple[Any, ...] = ()
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     text: str = ""
+    plan: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)

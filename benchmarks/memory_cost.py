@@ -2,14 +2,15 @@
 
     python -m benchmarks.memory_cost [--json] [--methods base amem] [--steps 20] [--preset rl] [--to DIR]
 
-Each registered memory under `react` plays the same shift of DeliveryBench for `--steps` steps (SmolLM2, sampled; the
-snapshot layout, in which memory is all that is known of earlier steps), with the preset `rl` where it has presets. Per
-step: calls, tokens in (and how many of them from the cache), tokens out; the wall-clock time of retrieval less its
+Each memory of this package under `react` plays the same shift of DeliveryBench for `--steps` steps (SmolLM2, sampled;
+the snapshot layout, in which memory is all that is known of earlier steps), with the preset `rl` where it has presets.
+Per step: calls, tokens in (and how many of them from the cache), tokens out; the wall-clock time of retrieval less its
 model calls; the state at the end; the share of memory's answers that could not be read, was cut off or did not fit.
 
 `--to DIR` writes one file a method, `DIR/NAME.json`, as soon as it has played, and `DIR/memory.md`, the table of all
 that are there. A method whose file is there and was measured under the same settings is not played again, so a run
-that was stopped goes on where it was, and methods may be measured one at a time. One that failed is tried again.
+that was stopped goes on where it was, and methods may be measured one at a time. One that failed is tried again. Those
+that are left play side by side and share batches; what each is asked and answers does not depend on it.
 
 The paper's ratios are its tokens per step relative to ReAct + Base of the same table (`../shared/paper/results.csv`,
 the median over its backbones, with the range): large models, the method's own cadence, long outputs. Ours are of a
@@ -19,6 +20,7 @@ small model with the cheap preset, so the ratios are set side by side, not teste
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import statistics
 import time
@@ -111,11 +113,16 @@ def _has_minilm() -> bool:
 
 def played(settings: Mapping[str, Any], llm: LLM) -> dict[str, Any]:
     """The figures of one memory, or `{"failed": why}`."""
+    return asyncio.run(play(settings, llm))
+
+
+async def play(settings: Mapping[str, Any], llm: LLM) -> dict[str, Any]:
+    """As `played`, beside others."""
     spec, observer = observed(AgentSpec.from_data(settings["agent"]))
     steps = settings["steps"]
     task = Task("deliverybench", settings["seed"], {**settings["options"], "max_steps": steps})
     began = time.perf_counter()
-    [trajectory] = Runner(spec, llm, max_steps=steps).run([Job(task)])
+    [trajectory] = await Runner(spec, llm, max_steps=steps).run_async([Job(task)])
     if trajectory.status != "completed":
         return {"failed": trajectory.error}
     preset = settings["agent"]["memory"].get("preset", "")
@@ -130,7 +137,7 @@ def figures(trajectory: Trajectory, observer: Observer) -> dict[str, Any]:
     steps = len(trajectory.transitions)
     usage = [c.usage for c in trajectory.calls]
     purposes: dict[str, list[LLMCall]] = defaultdict(list)
-    decisions = []
+    decisions: list[LLMCall] = []
     for call in trajectory.calls:
         own = call.tag.module.startswith("memory.")
         (purposes[call.tag.purpose] if own else decisions).append(call)
@@ -213,22 +220,29 @@ def measure(
     Returns:
         the exit code: 1 if a method failed.
     """
-    everything = list(REGISTRY.all("memory"))
+    everything = [name for name, entry in REGISTRY.all("memory").items() if not entry.declaration.extra]
     wanted = [n if ":" in n else REGISTRY.get("memory", n).name for n in methods] or everything
-    rows: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys([BASELINE, *wanted]):
-        settings = settings_of(name, **given)
-        row = recorded(folder, name, settings)
-        known = row is not None and "failed" not in row
-        if row is None or not known:
-            llm = llm or Policy.parse(given["model"]).build()
-            row = played(settings, llm)
-        rows[name] = row
+    settings = {name: settings_of(name, **given) for name in dict.fromkeys([BASELINE, *wanted])}
+    rows = {name: row for name in settings if (row := recorded(folder, name, settings[name])) and "failed" not in row}
+    known = set(rows)
+
+    async def one(name: str, llm: LLM) -> None:
+        rows[name] = row = await play(settings[name], llm)
         if not quiet:
-            print(f"{name:20} {'(measured before) ' * known}{row}", flush=True)
-        if folder and not known:
+            print(f"{name:20} {row}", flush=True)
+        if folder:
             folder.mkdir(parents=True, exist_ok=True)
-            write_atomic(folder / f"{name}.json", json.dumps({"settings": settings, "figures": row}, indent=1) + "\n")
+            content = json.dumps({"settings": settings[name], "figures": row}, indent=1) + "\n"
+            write_atomic(folder / f"{name}.json", content)
+
+    async def together(names: Sequence[str], llm: LLM) -> None:
+        await asyncio.gather(*(one(name, llm) for name in names))
+
+    if left := [name for name in settings if name not in known]:
+        llm = llm or Policy.parse(given["model"]).build()
+        assert llm is not None, "a scripted policy asks no memory"
+        asyncio.run(together(left, llm))
+    rows = {name: rows[name] for name in settings}
     paper = paper_ratios()
     command = "python -m benchmarks.memory_cost" + "".join(
         f" --{name} {value}" for name, value in given.items() if value != DEFAULTS[name]

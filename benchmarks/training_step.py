@@ -1,6 +1,6 @@
 """One update on the same rows: prefix-tree packing beside stock TRL's padded rows.
 
-    python -m benchmarks.training_step [--json] [--rollouts 4] [--turns 8] [--repeats 3]
+    python -m benchmarks.training_step [--json] [--rollouts 4] [--turns 8] [--repeats 3] [--adapter NAME]
 
 Rows have the shape of real episodes in three layouts (token counts of the quick-start: a static prompt, then an
 observation and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one
@@ -8,6 +8,12 @@ per summary segment. Both sides see the same tokens, masks and advantages and th
 A B A B, in one process, and the median is reported. Stock TRL gets its own batches: prompts padded left, completions
 padded right, the rows of a micro-batch as they come. ``max_rel_grad_diff`` is the largest relative difference of a
 parameter's gradient.
+
+The policy is the quick-start's: LoRA on the upper 12 of 30 layers. ``ours`` starts above the frozen ones, from what the
+local backend left of them while it sampled, as training does; ``alone`` has to compute that itself. ``cpu_ratio``
+compares seconds of processor time, which a busy machine blurs less. ``utilisation`` is the time that the update's
+matrix products and its logits would take at the ceilings measured in the same run (a large product; a copy), over the
+processor time it took; attention is not counted.
 """
 
 from __future__ import annotations
@@ -112,6 +118,21 @@ def our_update(trainer: Any, rows: Sequence[Any], count: int) -> Callable[[], No
     return run
 
 
+def read_by_rollouts(trainer: Any, rows: Sequence[Any]) -> None:
+    """Leave behind what sampling these rows would have: every row's tokens, read by the local backend."""
+    from agentspec.llm.local.rows import Job
+    from agentspec.types import Sampling
+
+    llm = trainer.llm
+    jobs = []
+    for number, row in enumerate(rows):
+        end = len(row.sequence) - row.sequence.mask[::-1].index(1) - 1
+        jobs.append(Job(str(number), row.sequence.tokens[:end], Sampling(max_tokens=1)))
+    if trainer._recorder is not None:
+        trainer._recorder.clear()
+    llm._engine.run(jobs)
+
+
 def _accumulate(trainer: Any, count: int) -> None:
     """One optimiser step of ``count`` micro-batches, on-policy."""
     trainer.current_gradient_accumulation_steps = count
@@ -119,7 +140,7 @@ def _accumulate(trainer: Any, count: int) -> None:
     trainer.args.steps_per_generation = count
 
 
-def trainers_for(model_name: str) -> tuple[Any, Any]:
+def trainers_for(model_name: str, adapter: str) -> tuple[Any, Any]:
     """A stock and one of our trainers over equal LoRA policies."""
     from datasets import Dataset
     from trl import GRPOConfig, GRPOTrainer
@@ -140,7 +161,7 @@ def trainers_for(model_name: str) -> tuple[Any, Any]:
         "per_device_train_batch_size": 2,
         "loss_type": "dapo",
     }
-    config = ScaffoldConfig(**common, model=model_name, packing="tree")
+    config = ScaffoldConfig(**common, model=model_name, adapter=adapter, packing="tree")
     built = []
     for kind in ("stock", "ours"):
         model, tokenizer = load_policy(config)
@@ -168,15 +189,36 @@ def gradients(trainer: Any) -> dict[str, torch.Tensor]:
     return named
 
 
-def measure(run: Callable[[], None]) -> tuple[float, float]:
-    """Seconds and peak additional memory (MB) of one call."""
+def measure(run: Callable[[], None]) -> dict[str, float]:
+    """Seconds, of processor time too (per thread), and peak additional memory (MB) of one call."""
     with PeakMemory() as memory:
-        start = time.perf_counter()
+        start, used = time.perf_counter(), time.process_time()
         run()
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        seconds = time.perf_counter() - start
-    return seconds, memory.peak_mb
+        seconds, used = time.perf_counter() - start, time.process_time() - used
+    cpu = seconds if torch.cuda.is_available() else used / torch.get_num_threads()
+    return {"s": seconds, "cpu_s": cpu, "mb": memory.peak_mb}
+
+
+def ceilings(device: torch.device) -> tuple[float, float]:
+    """FLOP/s of a large product of matrices, bytes/s of a copy (read and written): the best of five of each."""
+    a, b = torch.randn(2048, 576, device=device), torch.randn(576, 1536, device=device)
+    x = torch.randn(1 << 24, device=device)
+    y = torch.empty_like(x)
+    product = min(measure(lambda: torch.mm(a, b))["cpu_s"] for _ in range(5))
+    copy = min(measure(lambda: y.copy_(x))["cpu_s"] for _ in range(5))
+    return 2 * a.shape[0] * a.shape[1] * b.shape[1] / product, 8 * x.numel() / copy
+
+
+def floor(update: Callable[[], None], logits: int, device: torch.device) -> float:
+    """Seconds that the matrix products of an update, and writing and reading its logits both ways, take at best."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    with FlopCounterMode(display=False) as counter:
+        update()
+    flops, copied = ceilings(device)
+    return counter.get_total_flops() / flops + 4 * 4 * logits / copied
 
 
 class PeakMemory:
@@ -221,29 +263,41 @@ def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) 
     vocabulary = int(ours.model.get_input_embeddings().weight.shape[0])
     rows = make_rows(layout, options.rollouts, options.turns or LAYOUTS[layout], vocabulary)
     theirs, mine = stock_update(stock, rows, options.micro), our_update(ours, rows, options.ours_micro)
-    times: dict[str, list[float]] = {"trl": [], "ours": []}
-    memory: dict[str, list[float]] = {"trl": [], "ours": []}
+    alone = ours.llm and ours._recorder is not None
+    sides = [("trl", stock, theirs), ("ours", ours, mine), *([("alone", ours, mine)] if alone else [])]
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name, *_ in sides}
     grads: dict[str, dict[str, torch.Tensor]] = {}
     for _ in range(options.repeats):
-        for name, trainer, update in (("trl", stock, theirs), ("ours", ours, mine)):
+        for name, trainer, update in sides:
+            if name == "ours":
+                read_by_rollouts(ours, rows)
+            elif name == "alone":
+                ours._recorder.clear()
             _release()
-            seconds, peak = measure(update)
-            times[name].append(seconds)
-            memory[name].append(peak)
+            measured[name].append(measure(update))
             grads[name] = gradients(trainer)
-    difference = max(
-        float((grads["ours"][n] - g).norm() / g.norm()) for n, g in grads["trl"].items() if float(g.norm()) > 0
-    )
-    ours_s, trl_s = statistics.median(times["ours"]), statistics.median(times["trl"])
-    return {
-        "ours_s": ours_s,
-        "trl_s": trl_s,
-        "ratio": trl_s / ours_s,
-        "ours_mb": statistics.median(memory["ours"]),
-        "trl_mb": statistics.median(memory["trl"]),
-        "memory_ratio": statistics.median(memory["trl"]) / max(1.0, statistics.median(memory["ours"])),
-        "max_rel_grad_diff": difference,
-        "packing_ratio": build_tree([r.sequence.tokens for r in rows]).packing_ratio,
+    read_by_rollouts(ours, rows)
+    trained = sum(r.sequence.trained for r in rows)
+    least = floor(mine, trained * vocabulary, next(ours.model.parameters()).device)
+    gradients(ours)
+    result: dict[str, float] = {
+        f"{name}_{key}": statistics.median(m[key] for m in runs)
+        for name, runs in measured.items()
+        for key in ("s", "cpu_s", "mb")
+    }
+    return result | {
+        "ratio": result["trl_s"] / result["ours_s"],
+        "cpu_ratio": result["trl_cpu_s"] / result["ours_cpu_s"],
+        "alone_cpu_ratio": result["trl_cpu_s"] / result["alone_cpu_s" if alone else "ours_cpu_s"],
+        "memory_ratio": result["trl_mb"] / max(1.0, result["ours_mb"]),
+        "utilisation": least / result["ours_cpu_s"],
+        "max_rel_grad_diff": max(
+            float((grads[name][n] - g).norm() / g.norm())
+            for n, g in grads["trl"].items()
+            if float(g.norm()) > 0
+            for name in grads
+        ),
+        "packing_ratio": sum(len(r.sequence) for r in rows) / len(build_tree([r.sequence.tokens for r in rows]).tokens),
         "rows": len(rows),
     }
 
@@ -262,6 +316,7 @@ def main() -> None:
     """Run all layouts and print a table, or JSON."""
     parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--model", default="smollm2-135m")
+    parser.add_argument("--adapter", default="smollm2-135m-courier", help="empty: a new one, on all layers")
     parser.add_argument("--rollouts", type=int, default=4, help="8 and 12 turns take stock TRL more than 24 GB")
     parser.add_argument("--turns", type=int, help="of every layout (default: 8, supo 16)")
     parser.add_argument("--repeats", type=int, default=3)
@@ -270,7 +325,7 @@ def main() -> None:
     parser.add_argument("--layouts", nargs="*", default=list(LAYOUTS))
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    stock, ours = trainers_for(options.model)
+    stock, ours = trainers_for(options.model, options.adapter)
     results = {layout: run_layout(layout, stock, ours, options) for layout in options.layouts}
     if options.json:
         print(json.dumps(results))
@@ -278,6 +333,8 @@ def main() -> None:
     for layout, r in results.items():
         print(
             f"{layout:<13} ours {r['ours_s']:7.2f} s  trl {r['trl_s']:7.2f} s  ratio {r['ratio']:.2f}x  "
+            f"(processor time {r['cpu_ratio']:.2f}x, alone {r['alone_cpu_ratio']:.2f}x)  "
+            f"utilisation {r['utilisation']:.0%}  "
             f"memory {r['memory_ratio']:.2f}x  gradient difference {r['max_rel_grad_diff']:.1e}  "
             f"packing {r['packing_ratio']:.2f}"
         )

@@ -53,7 +53,7 @@ def export_inspect(source: str | Path, folder: str | Path, *, pictures: bool = F
         raise SpecError("export to Inspect needs it: pip install 'agentspec-rl[inspect]'") from None
     written = []
     for name, rows, episodes, when in _cells(Path(source)):
-        log = _log(name, rows, episodes, when, _advantages(Path(source)), pictures=pictures)
+        log = _log(name, rows, episodes, when, advantages_of(Path(source)), pictures=pictures)
         path = Path(folder) / f"{'_'.join(map(slug, filter(None, name)))}.eval"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_eval_log(log, str(path))
@@ -88,7 +88,7 @@ def _evaluated(results: Path) -> Iterator[tuple[Named, list[Row], list[Trajector
         raise SpecError(f"{results} names no trajectories; evaluate with --trajectories (`trajectories: true`)")
     names = dict.fromkeys((r["tasks"], r["policy"], r.get("run", ""), r["scaffold"]) for r in kept)
     for tasks, policy, run, scaffold in names:
-        rows = [
+        rows: list[Row] = [
             r
             for r in kept
             if (r["tasks"], r["policy"], r.get("run", ""), r["scaffold"]) == (tasks, policy, run, scaffold)
@@ -101,7 +101,7 @@ def _written(path: Path) -> datetime:
     return datetime.fromtimestamp(path.stat().st_mtime, UTC)
 
 
-def _advantages(source: Path) -> Advantages:
+def advantages_of(source: Path) -> Advantages:
     """From the receipts of a training run: what each episode's tokens were trained towards."""
     path = source / "updates.jsonl"
     if not source.is_dir() or not path.is_file():
@@ -162,7 +162,7 @@ def _sample(t: Trajectory, when: datetime, advantages: Advantages, pictures: boo
     from inspect_ai.scorer import Score
 
     first = t.transitions[0].input if t.transitions else None
-    shown = _pictures(t) if pictures else {}
+    shown = pictures_of(t) if pictures else {}
     metric = primary_metric([{"env": t.task.env, **t.metrics}])
     names = dict.fromkeys([metric.name, "return", "success"])
     numbers = {n: t.metrics.get(n) for n in names if isinstance(t.metrics.get(n), bool | int | float)}
@@ -353,7 +353,7 @@ def _plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str).replace("NaN", "null").replace("Infinity", "null"))
 
 
-def _pictures(t: Trajectory) -> dict[int, str]:
+def pictures_of(t: Trajectory) -> dict[int, str]:
     """Step -> what the environment renders before it, as a small data URL; empty where it renders nothing."""
     import io
     from dataclasses import replace

@@ -20,6 +20,7 @@ from agentspec.types import (
     Decision,
     Experience,
     Recall,
+    RecallItem,
     Task,
     Transition,
 )
@@ -46,6 +47,13 @@ class NoteTaker(BaseMemory):
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         await self._ask("end")
+
+
+class Diary(BaseMemory):
+    """A memory that tells its steps whatever the conversation holds."""
+
+    async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
+        return Recall(tuple(RecallItem(line, source="memory.diary") for _, line, _ in self._steps))
 
 
 @pytest.fixture
@@ -148,7 +156,8 @@ def test_state_restores_equal_in_order_too() -> None:
 
 
 def test_a_long_sheet_and_the_newest_steps_reach_the_prompt() -> None:
-    spec = AgentSpec.from_data({"reasoning": "direct", "memory": {"name": "base", "window": 20}, "recall_tokens": 64})
+    memory = {"name": "base", "window": 20, "observation_tokens": 0}
+    spec = AgentSpec.from_data({"reasoning": "direct", "memory": memory, "recall_tokens": 64, "layout": "snapshot"})
     prompts: list[str] = []
 
     def script(request: Request) -> str:
@@ -224,7 +233,7 @@ def test_recall_in_the_newest_turn_makes_a_row_per_step_and_every_action_is_trai
 
     rows = {}
     for placement in ("newest", "kept"):
-        (played,) = play(steps=6, memory={"name": "base", "window": 3}, recall=placement)
+        (played,) = play(steps=6, memory={"name": "tests.test_seams:Diary", "window": 3}, recall=placement)
         rows[placement] = build_sequences(played)
         trained = sorted(c for row in rows[placement] for c, m in zip(row.calls, row.mask, strict=True) if m)
         # Six actions of "WAIT()" and the end of the turn: 7 tokens each, none twice, none lost.

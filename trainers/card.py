@@ -9,17 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from agentspec.files import write_atomic
 from agentspec.llm.models import hub_id
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
+from trainers.mixin import Base
 
 FILE = "README.md"
 

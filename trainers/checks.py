@@ -16,7 +16,7 @@ from trl import GRPOConfig
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import SpecError
+from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS
 from trainers.fields import field_rules
@@ -113,6 +113,11 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
             yield f"{name} {missing} match no call of this scaffold, so they would change nothing; its calls: {there}"
     temperatures = {"sampling.temperature": spec.sampling.temperature}
     for kind in MODULE_KINDS:
+        if why := REGISTRY.get(kind, getattr(spec, kind).name).declaration.untrainable:
+            yield (
+                f"agent.{kind} {getattr(spec, kind).name!r} cannot be trained through: {why}; train inside a method of "
+                "this package, and evaluate with this one"
+            )
         if any(train.matches(p) for p in paths if p.startswith(f"{kind}.")):
             given = getattr(spec, kind).params.items()
             temperatures |= {f"{kind}.{n}": v for n, v in given if n.endswith("temperature") and v is not None}

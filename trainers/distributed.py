@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from trl.distributed import DistributedBackend
@@ -19,12 +19,8 @@ from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import LLMCall
 from trainers.config import ScaffoldConfig
+from trainers.mixin import Base
 from trainers.sequences import TrainFilter, trained_completions
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 
 def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:

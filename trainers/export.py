@@ -14,7 +14,9 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from agentspec.files import digest, file_digest, write_atomic
@@ -76,27 +78,24 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
     try:
         recorded = _recorded(run)
         base = _base(recorded, trained)
-        if trained.adapter and merge:
+        if base is None:
+            _copy(trained.folder, work, MODEL_FILES)
+        elif merge:
             _merge(trained.folder, base, work)
         else:
-            patterns = (ADAPTER, ADAPTER_CONFIG) if trained.adapter else MODEL_FILES
-            _copy(trained.folder, work, patterns)
-        if base is not None and not merge:
+            _copy(trained.folder, work, (ADAPTER, ADAPTER_CONFIG))
             _name_base(work / ADAPTER_CONFIG, base)
         _tokenizer(trained.folder, base, work)
         manifest = _manifest(run, recorded, trained, base, work, merged=merge and trained.adapter)
         config = {**recorded["config"], "model": manifest["base_model"]["name"]}
-        card = model_card(
-            to.name,
-            config,
-            manifest["scaffold"],
-            adapter=trained.adapter and not merge,
-            note=f"{manifest['kind']}, from the run's {manifest['source']}",
-        )
-        write_atomic(work / FILE, card)
+        note = f"{manifest['kind']}, from the run's {manifest['source']}"
+        adapter = trained.adapter and not merge
+        write_atomic(work / FILE, model_card(to.name, config, manifest["scaffold"], adapter=adapter, note=note))
         manifest["files"] = {path.name: file_digest(path) for path in sorted(work.iterdir())}
         write_atomic(work / MANIFEST, json.dumps(manifest, indent=2, sort_keys=True) + "\n")
-        _make_readable(work)
+        work.chmod(0o755)  # temporary folders, and some writers' files, are private
+        for path in work.iterdir():
+            path.chmod(0o644)
         os.replace(work, to)  # onto an empty folder or nothing
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -134,25 +133,22 @@ def _base(run: Mapping[str, Any], trained: Trained) -> ModelSource | None:
     config = trained.folder / ADAPTER_CONFIG
     recorded = json.loads(config.read_text(encoding="utf-8")).get("base_model_name_or_path")
     sources: dict[str, str] = {}
-    errors: list[ModelNotFoundError] = []
-    for name in (recorded, run["config"].get("model")):
-        if name:
-            try:
-                sources[name] = resolve(name).path
-            except ModelNotFoundError as error:
-                errors.append(error)
+    problem = ModelNotFoundError(
+        f"neither the run's {RUN_MANIFEST} nor the adapter says which model it was trained on; write its name into "
+        f"base_model_name_or_path of {config}"
+    )
+    for name in filter(None, (run["config"].get("model"), recorded)):
+        try:
+            sources[name] = resolve(name).path
+        except ModelNotFoundError as error:
+            problem = error
     if not sources:
-        if errors:
-            raise errors[0]
-        raise ModelNotFoundError(
-            f"neither the run's {RUN_MANIFEST} nor the adapter says which model it was trained on; write its name into "
-            f"base_model_name_or_path of {config}"
-        )
-    path = next(iter(sources.values()))
-    return ModelSource(path, [name for name, found in sources.items() if found == path][-1])
+        raise problem
+    path = list(sources.values())[-1]
+    return ModelSource(path, next(name for name, found in sources.items() if found == path))
 
 
-def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
+def _merge(adapter: Path, base: ModelSource, to: Path) -> None:
     """Write base model + adapter as one model.
 
     The sum is formed in single precision even for a half-precision base: rounding happens once, when saving.
@@ -161,19 +157,11 @@ def _merge(adapter: Path, base: ModelSource | None, to: Path) -> None:
     from peft import PeftModel
     from transformers import AutoModelForCausalLM
 
-    assert base is not None  # only adapters are merged
     model = AutoModelForCausalLM.from_pretrained(base.path, dtype="auto")
     dtype = model.dtype
     model = PeftModel.from_pretrained(model.to(torch.float32), str(adapter), is_trainable=False)
     merged = model.merge_and_unload(safe_merge=True).to(dtype)
     merged.save_pretrained(to)
-
-
-def _make_readable(folder: Path) -> None:
-    """Ordinary permissions: temporary folders, and some writers' files, are private."""
-    folder.chmod(0o755)
-    for path in folder.iterdir():
-        path.chmod(0o644)
 
 
 def _name_base(config: Path, base: ModelSource) -> None:
@@ -203,6 +191,7 @@ def _manifest(
     run: Path, recorded: Mapping[str, Any], trained: Trained, base: ModelSource | None, work: Path, *, merged: bool
 ) -> dict[str, Any]:
     config, tokenizer = recorded["config"], work / "tokenizer.json"
+    more = {name: metadata.version(name) for name in ("peft", "safetensors", "trl")}
     return {
         "format": FORMAT,
         "kind": "merged model" if merged else "adapter" if trained.adapter else "model",
@@ -216,7 +205,7 @@ def _manifest(
         "environment": config.get("environment"),
         "template_sha256": _template_sha256(work),
         "tokenizer_sha256": file_digest(tokenizer) if tokenizer.is_file() else "",
-        "versions": {"export": versions() | _more_versions(), "training": recorded.get("versions", {})},
+        "versions": {"export": versions() | more, "training": recorded.get("versions", {})},
         "rewards": reward_summary(RunLog(run).read(METRICS)),
     }
 
@@ -232,15 +221,9 @@ def reward_summary(rows: Iterable[dict[str, Any]], *, key: str = "reward", windo
     if not points:
         return {}
     values = [value for _, value in points]
-    n = min(window, len(values))
     best_step, best = max(points, key=lambda p: p[1])
-    return {
-        "steps": points[-1][0],
-        "first": sum(values[:n]) / n,
-        "last": sum(values[-n:]) / n,
-        "best": best,
-        "best_step": best_step,
-    }
+    ends = {"first": fmean(values[:window]), "last": fmean(values[-window:])}
+    return {"steps": points[-1][0], **ends, "best": best, "best_step": best_step}
 
 
 def _recorded(run: Path) -> dict[str, Any]:
@@ -261,19 +244,11 @@ def _revision(base: ModelSource | None) -> str:
 
 def _template_sha256(folder: Path) -> str:
     """Digest of the chat template, wherever this version of the library keeps it; empty without one."""
-    template = ""
-    if (folder / "chat_template.jinja").is_file():
-        template = (folder / "chat_template.jinja").read_text(encoding="utf-8")
-    elif (folder / "tokenizer_config.json").is_file():
-        config = json.loads((folder / "tokenizer_config.json").read_text(encoding="utf-8"))
-        template = config.get("chat_template") or ""
-    if not template:
-        return ""
+    file, config = folder / "chat_template.jinja", folder / "tokenizer_config.json"
+    template: Any = ""
+    if file.is_file():
+        template = file.read_text(encoding="utf-8")
+    elif config.is_file():
+        template = json.loads(config.read_text(encoding="utf-8")).get("chat_template")
     text = template if isinstance(template, str) else json.dumps(template, sort_keys=True)
-    return digest(text)
-
-
-def _more_versions() -> dict[str, str]:
-    from importlib import metadata
-
-    return {name: metadata.version(name) for name in ("peft", "safetensors", "trl")}
+    return digest(text) if template else ""

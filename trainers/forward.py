@@ -7,7 +7,9 @@ and entropies are in the figures of the update, but they cost no backward pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import nn
@@ -15,14 +17,27 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.checkpoint import checkpoint
 
 from agentspec.tokens import shared_prefix
+from trainers.frozen import LIMIT, FrozenOutput, language_model, output_of
 from trainers.logprobs import sampled_logprobs
+from trainers.lora import merged_lora
 from trainers.micro_batches import padding_row
 from trainers.sequences import Row, TokenSequence
-from trainers.tree.model import packed_inputs, wanted_tokens
+from trainers.tree.model import Wanted, packed_inputs
 from trainers.tree.trie import build_tree
 
 Packing = Literal["tree", "padded"]
 Places = Sequence[tuple[int, int]]
+Recorded = Callable[[Sequence[int]], torch.Tensor | None]
+"""Tokens -> what came out of the frozen layers when the rollouts read them, (n, hidden), if that is known."""
+FROZEN_TOKENS = 8192
+"""Tokens whose frozen output is computed in one forward of a tree, where no other budget is set."""
+
+
+class Packed(NamedTuple):
+    """Token lists as the inputs of one forward, shape (B, L), and where in it, flattened, the tokens of each are."""
+
+    inputs: dict[str, Any]
+    places: Sequence[Sequence[int]]
 
 
 def rows_logprobs(
@@ -32,6 +47,7 @@ def rows_logprobs(
     skip_backward: bool = False,
     packing: Packing = "padded",
     tokens_per_forward: int = 0,
+    frozen: FrozenOutput | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Log-probabilities and entropies of all trained tokens of a micro-batch.
 
@@ -43,6 +59,7 @@ def rows_logprobs(
         tokens_per_forward: token budget of a forward (0: no bound for a tree, one row for padded ones). If one forward
             does not hold the micro-batch, forwards are recomputed in the backward pass, so that activations of one
             chunk at a time are kept.
+        frozen: forwards of rows that it knows start above the model's frozen layers.
 
     Returns:
         two float32 tensors of shape (B, L-1), aligned with `completion_ids` of `trainers.micro_batches.collate`.
@@ -50,7 +67,7 @@ def rows_logprobs(
     trained = [i for i, r in enumerate(rows) if r.sequence.trained]
     still = [i for i in trained if skip_backward and rows[i].zero_gradient]
     live = [i for i in trained if i not in set(still)]
-    forward = _tree_forward if packing == "tree" else _padded_forward
+    forward = partial(_forward, packing=packing, frozen=frozen)
     chunks = list(_chunks(rows, live, packing, tokens_per_forward))
     recompute = packing == "tree" and len(chunks) > 1 and torch.is_grad_enabled()
     # DDP arms its gradient reduction in forward, once per backward: the first forward is its own and is not repeated
@@ -125,48 +142,105 @@ def _chunks(rows: Sequence[Row], todo: list[int], packing: Packing, budget: int)
         yield chunk
 
 
-def _tree_forward(
-    model: nn.Module, sequences: Sequence[TokenSequence], places: Places, device: torch.device
+def _forward(
+    model: nn.Module,
+    sequences: Sequence[TokenSequence],
+    places: Places,
+    device: torch.device,
+    *,
+    packing: Packing,
+    frozen: FrozenOutput | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probability and entropy of every place, from one packed forward."""
-    tokens = [s.tokens for s in sequences]
-    tree = build_tree(tokens)
-    output = model(
-        **packed_inputs(tree, device),
-        **wanted_tokens(
-            tree,
-            tokens,
-            places,
-            device,
-            temperatures=[sequences[r].temperatures[p] for r, p in places],
-            allowed=[sequences[r].allowed.get(p) for r, p in places],
-        ),
+    """Log-probability and entropy of every place, from one forward."""
+    packed = _packed(packing, _read(sequences, places), device)
+    count, length = packed.inputs["input_ids"].shape
+    before = torch.tensor([packed.places[r][p - 1] for r, p in places], device=device)
+    wanted = Wanted(
+        before,
+        torch.tensor([sequences[r].tokens[p] for r, p in places], device=device),
+        torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device),
+        tuple(sequences[r].allowed.get(p) for r, p in places),
     )
-    return output.log_probs, output.entropies
+    started = frozen.given(sequences, packed.places, (count, length)) if frozen else nullcontext()
+    with merged_lora(model), started:
+        if packing == "tree":
+            output = model(**packed.inputs, wanted=wanted)
+            return output.log_probs, output.entropies
+        # Only positions that some row trains are projected on the vocabulary.
+        keep, column = (before % length).unique(return_inverse=True)
+        logits = model(**packed.inputs, logits_to_keep=keep, use_cache=False).logits[before // length, column]
+    return sampled_logprobs(logits, wanted.tokens, wanted.temperatures, wanted.allowed)
 
 
-def _padded_forward(
-    model: nn.Module, sequences: Sequence[TokenSequence], places: Places, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probability and entropy of every place, from one padded forward."""
-    length = max(len(s) for s in sequences)
-    ids = torch.zeros(len(sequences), length, dtype=torch.long)
-    attention = torch.zeros_like(ids)
-    for i, s in enumerate(sequences):
-        ids[i, : len(s)] = torch.tensor(s.tokens)
-        attention[i, : len(s)] = 1
-    # The logits before a token decide it. Only positions that some row trains are projected on the vocabulary.
-    keep = sorted({p - 1 for _, p in places})
-    column = {p: k for k, p in enumerate(keep)}
-    logits = model(
-        input_ids=ids.to(device),
-        attention_mask=attention.to(device),
-        logits_to_keep=torch.tensor(keep, device=device),
-        use_cache=False,
-    ).logits
-    rows = torch.tensor([r for r, _ in places], device=device)
-    columns = torch.tensor([column[p - 1] for _, p in places], device=device)
-    tokens = torch.tensor([sequences[r].tokens[p] for r, p in places], device=device)
-    temperatures = torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device)
-    allowed = [sequences[r].allowed.get(p) for r, p in places]
-    return sampled_logprobs(logits[rows, columns], tokens, temperatures, allowed)
+def _read(sequences: Sequence[TokenSequence], places: Places) -> list[list[int]]:
+    """Of each sequence the tokens that something is predicted from: those before its last place."""
+    ends = [0] * len(sequences)
+    for r, p in places:
+        ends[r] = max(ends[r], p)
+    return [s.tokens[:end] for s, end in zip(sequences, ends, strict=True)]
+
+
+def _packed(packing: Packing, tokens: Sequence[list[int]], device: torch.device) -> Packed:
+    """The inputs of one forward of all token lists: a prefix tree, or rows padded right."""
+    if packing == "tree":
+        tree = build_tree(tokens)
+        return Packed(packed_inputs(tree, device), tree.places)
+    length = max(map(len, tokens))
+    ids = torch.tensor([[*t, *[0] * (length - len(t))] for t in tokens], device=device)
+    mask = torch.tensor([[1] * len(t) + [0] * (length - len(t)) for t in tokens], device=device)
+    places = [range(i * length, i * length + len(t)) for i, t in enumerate(tokens)]
+    return Packed({"input_ids": ids, "attention_mask": mask}, places)
+
+
+def frozen_output(
+    model: nn.Module,
+    layers: Sequence[nn.Module],
+    rows: Sequence[Row],
+    *,
+    packing: Packing = "padded",
+    tokens_per_forward: int = 0,
+    recorded: Recorded = lambda tokens: None,
+    limit: int = LIMIT,
+) -> FrozenOutput | None:
+    """What comes out of the frozen `layers` of `model` for the trained rows of a round, as many as fit into `limit`.
+
+    Args:
+        recorded: what the rollouts know of it; the rest is computed, `tokens_per_forward` at a time.
+        limit: bytes of output to keep.
+    """
+    if not layers:
+        return None
+    decoder, weights = language_model(model).base_model, next(model.parameters())
+    width = decoder.config.hidden_size
+    rows = sorted((r for r in rows if r.sequence.trained), key=lambda r: r.sequence.tokens)
+    places = [(i, p) for i, r in enumerate(rows) for p, m in enumerate(r.sequence.mask) if m]
+    tokens = _first(_read([r.sequence for r in rows], places), limit // (width * weights.element_size()))
+    if not tokens:
+        return None
+    tree = build_tree(tokens)
+    states, missing = weights.new_empty(len(tree.tokens), width), []
+    for i, read in enumerate(tokens):
+        known = recorded(read)
+        if known is None:
+            missing.append(i)
+        else:
+            states[tree.places[i]] = known
+    budget = tokens_per_forward or (FROZEN_TOKENS if packing == "tree" else 0)
+    for chunk in _chunks(rows, missing, packing, budget):
+        packed = _packed(packing, [tokens[i] for i in chunk], weights.device)
+        found = output_of(decoder, layers, **packed.inputs).flatten(0, 1)
+        for i, here in zip(chunk, packed.places, strict=True):
+            states[tree.places[i]] = found[list(here)]
+    output = FrozenOutput(layers, states)
+    for row, there in zip(rows, tree.places, strict=False):  # those that fit
+        output.add(row.sequence, there)
+    return output
+
+
+def _first(tokens: Sequence[list[int]], distinct: int) -> list[list[int]]:
+    """As many of the sorted token lists as have at most `distinct` prefixes."""
+    for i, read in enumerate(tokens):
+        distinct -= len(read) - (shared_prefix(tokens[i - 1], read) if i else 0)
+        if distinct < 0:
+            return list(tokens[:i])
+    return list(tokens)

@@ -32,8 +32,10 @@ from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import play_beside
 from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, ScoredEpisode
-from trainers.distributed import KnownLayout, check_trained
+from trainers.distributed import KnownLayout, check_trained, is_sharded
 from trainers.finite import FiniteGuard, without_dropout
+from trainers.forward import frozen_output
+from trainers.frozen import FrozenOutput, frozen_layers, layer_above
 from trainers.losses import UpdateSize, loss
 from trainers.micro_batches import PADDED, ROWS, collate, padding_row, partition
 from trainers.policy_loss import PolicyLoss
@@ -91,6 +93,9 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
                 enable_tree(self.accelerator.unwrap_model(policy))
         self.add_callback(FiniteGuard)
         self._packing: dict[str, Any] = {"packing": args.packing, "tokens_per_forward": args.tokens_per_forward}
+        self._frozen = [] if is_sharded(self.accelerator) else frozen_layers(self.accelerator.unwrap_model(self.model))
+        self._recorder: Any = None  # of their output, while the local backend plays
+        self._below: FrozenOutput | None = None
         self.run_log = RunLog(args.output_dir)
         self._make_env = make_env
         self._make_llm = make_llm or partial(local_llm, batching=args.batching)
@@ -128,7 +133,11 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
 
             self._llm = trl_backend(self.vllm_generation, self.processing_class)
         if self._llm is None:
-            self._llm = self._make_llm(self.accelerator.unwrap_model(self.model), self.processing_class)
+            model = self.accelerator.unwrap_model(self.model)
+            self._llm = self._make_llm(model, self.processing_class)
+            # An update that finds a round half done, after a restart, could not have what the rollouts left.
+            if self._frozen and not self._off_policy and hasattr(self._llm, "record_states"):
+                self._recorder = self._llm.record_states(layer_above(model, self._frozen))
         return self._llm
 
     def _play_round(self, rows: list[dict[str, Any]]) -> list[ScoredEpisode]:
@@ -142,6 +151,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             memory=self._memory,
         )
         with self._current_weights():
+            if self._recorder:
+                self._recorder.clear()
             episodes = self._play(jobs)
             if self.credit_rule.writes.spec.function is None:
                 return episodes
@@ -204,6 +215,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         """The next micro-batch; a new generation round when the buffered ones are used up."""
         if self._step % self._steps_per_round == 0 or self._buffered_inputs is None:
             self._round = self.state.global_step
+            self._below = None  # not held while episodes are played
             self._played = self._play_round(generation_batch)
             self._memory = self._carried_memory()
             credited = self._credit()
@@ -232,6 +244,10 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
+        recorded = {"recorded": self._recorder.find} if self._recorder else {}
+        with self.accelerator.autocast():
+            policy, all_rows = self.accelerator.unwrap_model(self.model), [r for rows in micro_batches for r in rows]
+            self._below = frozen_output(policy, self._frozen, all_rows, **recorded, **self._packing)
         counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
         padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []

@@ -7,7 +7,7 @@ Mixed into the trainer. TRL computes TRL's losses, from log-probabilities that a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -18,13 +18,9 @@ from trainers.finite import require_finite
 from trainers.forward import rows_logprobs
 from trainers.losses import divergence
 from trainers.micro_batches import PADDED, ROWS
+from trainers.mixin import Base
 from trainers.sequences import Row
 from trainers.vllm import importance_ratio
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 
 class PolicyLoss(Base):
@@ -59,7 +55,7 @@ class PolicyLoss(Base):
             model = self.accelerator.unwrap_model(self.model)
             initial = self.args.reference == "initial" and "ref" in model.peft_config  # TRL's copy of the adapter
             with use_adapter(model, adapter_name="ref" if initial else None):
-                return rows_logprobs(model, rows, **self._packing)[0]
+                return rows_logprobs(model, rows, frozen=self._below, **self._packing)[0]
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> torch.Tensor:
         self._current = inputs
@@ -106,7 +102,9 @@ class PolicyLoss(Base):
         inputs = self._current
         assert inputs is not None, "log-probabilities are computed inside a loss"
         with self.accelerator.autocast():
-            logps, entropies = rows_logprobs(model, inputs[ROWS], skip_backward=self._skip_backward, **self._packing)
+            logps, entropies = rows_logprobs(
+                model, inputs[ROWS], skip_backward=self._skip_backward, frozen=self._below, **self._packing
+            )
         trained, current = inputs["tool_mask"], logps.detach()
         if self._step % self._steps_per_round < self.args.gradient_accumulation_steps:  # still those that sampled
             self._sampling_metrics.differences.append((current - inputs["sampled_logprobs"]).abs()[trained > 0])

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
@@ -24,13 +24,9 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 from agentspec.files import write_atomic
 from agentspec.registry import SpecError
 from trainers.micro_batches import ROWS
+from trainers.mixin import Base
 from trainers.run_folder import STATE, TRAINER_STATE, hold, set_aside
 from trainers.sequences import Row, TokenSequence
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 FORMAT = 2
 

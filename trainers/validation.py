@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from accelerate.utils import gather_object
 
@@ -18,12 +18,8 @@ from agentspec.metrics import figures
 from agentspec.spec import AgentSpec
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
+from trainers.mixin import Base
 from trainers.rollouts import starting_states, task_of
-
-if TYPE_CHECKING:
-    from trl import GRPOTrainer as Base
-else:
-    Base = object
 
 
 def validation_scaffolds(config: ScaffoldConfig) -> dict[str, AgentSpec]:

@@ -182,24 +182,16 @@ def _difference(ones: Sequence[float], others: Sequence[float], values: Values) 
     return math.fsum(scored[: len(ones)]) / len(ones) - math.fsum(scored[len(ones) :]) / len(others)
 
 
-def _no_plan(rule: WriteRule, steps: Sequence[int], seed: int) -> list[Plan]:
-    return []
-
-
 def _local_plan(rule: WriteRule, steps: Sequence[int], seed: int) -> list[Plan]:
     """Re-rolls with and without the writes drawn by the episode's own seed."""
     drawn = sorted(random.Random(f"writes {seed}").sample(list(steps), min(rule.points, len(steps))))
     return [Plan(step, kept, i) for step in drawn for kept in (True, False) for i in range(rule.rerolls)]
 
 
-def _ablation_plan(rule: WriteRule, steps: Sequence[int], seed: int) -> list[Plan]:
-    return [Plan(EVERY, kept=False)]
-
-
 WRITE_CREDITS: dict[str, WriteCredit] = {
     spec.name: spec
     for spec in (
-        WriteCredit("episode", "the episode's advantage, as of every other token", _no_plan),
+        WriteCredit("episode", "the episode's advantage, as of every other token", lambda *_: []),
         WriteCredit(
             "local",
             "re-rolls of the rest of the episode with the write, less re-rolls without it, from the same state",
@@ -207,7 +199,12 @@ WRITE_CREDITS: dict[str, WriteCredit] = {
             local,
             reads=("write_rerolls", "write_points"),
         ),
-        WriteCredit("ablation", "the episode less the same episode without any memory", _ablation_plan, ablation),
+        WriteCredit(
+            "ablation",
+            "the episode less the same episode without any memory",
+            lambda *_: [Plan(EVERY, kept=False)],
+            ablation,
+        ),
     )
 }
 """Every estimator of a write by name."""

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     for kind, entries in names.items():
         print(kind)
         for name, entry in entries.items():
-            notes = [note for note in (_calls(entry["calls"]), _needs(entry["needs"])) if note]
+            notes = [note for note in (_calls(entry["calls"]), _needs(entry["needs"], entry.get("extra", ""))) if note]
             print(f"  {name:<16} {entry['summary']}{' (' + '; '.join(notes) + ')' if notes else ''}")
     return 0
 
@@ -63,5 +63,6 @@ def _calls(profile: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _needs(needs: list[str]) -> str:
-    return f"needs {', '.join(needs)}" if needs else ""
+def _needs(needs: list[str], extra: str) -> str:
+    needed = [*needs, f"extra {extra}"] if extra else needs
+    return f"needs {', '.join(needed)}" if needed else ""

@@ -21,6 +21,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--runs", nargs="+", default=[], metavar="RECIPE=DIR,...", help="training runs, for learning curves"
     )
+    parser.add_argument(
+        "--publish", choices=("wandb", "tensorboard"), help="log tables, figures and the report there as well"
+    )
+    parser.add_argument("--project", default="agentspec", help="with --publish wandb (default: %(default)s)")
     parser.add_argument("--paper", action="store_true", help="set the paper's numbers beside ours")
     parser.set_defaults(command=run)
 
@@ -37,6 +41,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise SpecError(str(error)) from error
     for path in write_files(report, arguments.to):
         print(path)
+    if arguments.publish:
+        from eval.report.publish import publish
+
+        print(publish(report, arguments.to, arguments.publish, project=arguments.project))
     return 0
 
 

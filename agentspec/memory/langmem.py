@@ -21,7 +21,7 @@ from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -177,7 +177,10 @@ class LangMem:
         for key, score in self._nearest(self._fact_index, input.text, self.query_limit if k is None else k):
             items.append(RecallItem(f"- {self.facts[key]}", score, "semantic", str(key), 2.0 + score))
         if self.services.context.layout == "snapshot" and self.recent:
-            items += [RecallItem(text, priority=5.0 + i) for i, text in enumerate(self._steps[-self.recent :])]
+            items += [
+                RecallItem(brief(text, self.services.llm.count_tokens), priority=5.0 + i)
+                for i, text in enumerate(self._steps[-self.recent :])
+            ]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:

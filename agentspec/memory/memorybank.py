@@ -25,7 +25,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    DATA,
+    brief,
+    distinct,
+    first_held,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -202,7 +212,8 @@ class MemoryBank:
             items.append(RecallItem(self._plan, 1.0, "insight", priority=2.5))
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
-            items += [RecallItem(self._named(e), 1.0, priority=4.0 + e.step) for e in newest]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -327,9 +338,10 @@ class MemoryBank:
         found: list[tuple[int, float]] = []
         for kind, index in self._index.items():
             hidden = max(0, now.step - shown_from) if kind == "raw" else 0
-            hits = index.search(query, self.quota[kind] + hidden) if self.quota[kind] else []
+            hits = index.search(query, 2 * self.quota[kind] + hidden) if self.quota[kind] else []
             if kind == "raw":
                 hits = [h for h in hits if not self._is_shown(self.entries[h[0]], now.episode, shown_from)]
+                hits = distinct(hits, lambda key: self.entries[key].text)
             found += hits[: self.quota[kind]]
         return found
 

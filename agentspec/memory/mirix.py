@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
@@ -200,7 +200,9 @@ class Mirix:
             for key, score in self._search(store, query, self.top if k is None else k):
                 items.append(RecallItem(f"[{store}] {self.entries[key].text}", score, store, str(key), 1.0 + score))
         if self.services.context.layout == "snapshot" and self.recent:
-            items += [RecallItem(text, priority=5.0 + i) for i, text in enumerate(self._steps[-self.recent :])]
+            count = self.services.llm.count_tokens
+            newest = enumerate(self._steps[-self.recent :])
+            items += [RecallItem(brief(text, count), priority=5.0 + i) for i, text in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:

@@ -10,7 +10,10 @@ Rewards are brought to the unit interval of the judge's values by the environmen
 off at -1 and 1 per step), and a path counts as a success where the environment says so or its return reaches that
 scale: one dollar is neither worth ten good judgements nor the end of the search.
 
-Cost per step at the paper's size: up to a thousand calls; preset `rl`: at most 22.
+A menu's entry is decoded under its constraint and holds no thought: there one is asked for first, in a call of its own,
+and the choice is made after it (`think`; preset `rl` leaves it out).
+
+Cost per step at the paper's size: up to a thousand calls, two thousand with a menu; preset `rl`: at most 22.
 
 Without snapshots the method is not LATS: it is refused, or, with `world="model"`, the model predicts what would be
 observed, as in RAP, and the trace says `world: model`.
@@ -39,7 +42,7 @@ from agentspec.prompting import (
 from agentspec.protocols import Services
 from agentspec.reasoning.search.judge import RATE, UNREAD, rate
 from agentspec.reasoning.search.meter import Meter, OutOfBudgetError, last_resort
-from agentspec.reasoning.search.propose import legal, sample_steps
+from agentspec.reasoning.search.propose import Proposal, legal, sample_steps, think_and_choose
 from agentspec.reasoning.search.tree import Node, backpropagate, close, nodes_where, select
 from agentspec.reasoning.search.world import ModelWorld, RealWorld, World, render_steps, root_outcome
 from agentspec.registry import SpecError
@@ -55,6 +58,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "root_samples": 10,
         "rollout": "simulate",
         "prediction_tokens": 128,
+        "think": True,
     },
     "rl": {
         "num_iterations": 4,
@@ -63,10 +67,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         "root_samples": 3,
         "rollout": "value",
         "prediction_tokens": 48,
+        "think": False,
     },
 }
 NEXT_FREE = "Write one sentence after 'Thought:' about what matters now, then one line 'Action: NAME(arguments)'."
 NEXT_MENU = "Answer with the one action that should come next, word for word."
+THINK_MENU = (
+    "Write one sentence about what matters now and what should come next; the choice itself is asked for after it."
+)
 REFLECT = (
     "This attempt is over and was not a success (return {total:g}). In one or two sentences: which step was the "
     "mistake, and what should be tried instead?"
@@ -101,6 +109,7 @@ class LanguageAgentTreeSearch:
             (`None`: its `typical_return`).
         reward_scale: factor on rewards, to bring them to the scale of values (`None`: 1 / `typical_return`).
         max_reflections: lessons kept in an episode (0: none are made).
+        think: menu mode: a thought before every choice in the environment, in a call of its own.
         world: `environment` or `model`, see the module's docstring.
         temperature: of proposals.
         max_calls: most requests per decision (`None`: no limit).
@@ -108,14 +117,14 @@ class LanguageAgentTreeSearch:
         path_tokens, lesson_tokens: budgets of prompt sections; of a path only observations are clipped.
         prediction_tokens: most tokens of a predicted observation, of a rating in words, and of a reflection.
         thought_tokens: most tokens of a proposal (`None`: the spec's `max_tokens`).
-        max_retries: further calls if nothing that was proposed is an action.
+        max_retries: further calls for proposals of which none is an action, all of a decision together.
     """
 
     declaration = Declaration(
         "Monte-Carlo tree search in the environment itself, with judged values and reflections on failures",
-        calls=CallProfile(step=(1, 1123)),
+        calls=CallProfile(step=(1, 2033)),
         rl=CallProfile(step=(1, 22)),
-        purposes=Purpose.each("step", "propose", "value", "reflect", "world"),
+        purposes=Purpose.each("step", "propose", "think", "value", "reflect", "world"),
         needs=("n", "snapshots"),
         waived={"snapshots": ("world", "model")},
     )
@@ -135,6 +144,7 @@ class LanguageAgentTreeSearch:
         success_return: float | None = None,
         reward_scale: float | None = None,
         max_reflections: int = 3,
+        think: bool | None = None,
         world: str = "environment",
         temperature: float = 1.0,
         max_calls: int | None = None,
@@ -152,9 +162,11 @@ class LanguageAgentTreeSearch:
             "root_samples": root_samples,
             "rollout": rollout,
             "prediction_tokens": prediction_tokens,
+            "think": think,
         }
         chosen: dict[str, Any] = settings("lats", PRESETS, preset, given)
         self.rollout: str = chosen.pop("rollout")
+        self.think: bool = chosen.pop("think")
         at_least("lats", 1, max_calls=max_calls, evaluations=evaluations, **chosen)
         at_least("lats", 0, max_reflections=max_reflections)
         one_of("lats", rollout=(self.rollout, ("simulate", "value")), world=(world, ("environment", "model")))
@@ -197,7 +209,7 @@ class LanguageAgentTreeSearch:
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
-        meter = Meter(self.services.llm, **self.limits)
+        meter = Meter(self.services.llm, **self.limits, retries=self.max_retries)
         simulator = self.services.simulator if self.world == "environment" else None
         if simulator is None:
             root, world = Node(state=root_outcome(input, None)), self._imagined(meter, base)
@@ -213,7 +225,7 @@ class LanguageAgentTreeSearch:
                 await simulator.restore(blob)
         trace = self._trace(search, root)
         decision = self._decision(search, root, input, trace)
-        return decision or await last_resort(meter, base, input.action_schema, trace, self.max_retries)
+        return decision or await last_resort(meter, base, input.action_schema, trace)
 
     def _imagined(self, meter: Meter, base: Sequence[Message]) -> World:
         return ModelWorld(
@@ -279,18 +291,9 @@ class LanguageAgentTreeSearch:
         """Sample actions, take each of them in the world, and let the judge value the states."""
         schema = node.state.schema
         imagined = node.depth > 0 and not search.world.real
-        form = NEXT_MENU if schema.choices and not imagined else NEXT_FREE
+        menu = bool(schema.choices) and not imagined
         wanted = self.samples if node.depth else self.root_samples
-        proposals = await sample_steps(
-            search.meter,
-            search.base,
-            schema,
-            self._request(node, form),
-            n=wanted,
-            imagined=imagined,
-            temperature=self.temperature,
-            **self.limit,
-        )
+        proposals = await self._propose(search, node, wanted, menu=menu, imagined=imagined)
         children = [Node(p.text, node, source=p.source, note=p) for p in proposals]
         # Kept before they are judged: should the budget end here, there is something to choose from.
         node.children = children
@@ -304,6 +307,15 @@ class LanguageAgentTreeSearch:
         for child in children:
             if child.terminal and not self._success(child):
                 close(child)
+
+    async def _propose(self, search: Search, node: Node, wanted: int, *, menu: bool, imagined: bool) -> list[Proposal]:
+        """Thoughts and actions for what comes after `node`: in one completion, or in menu mode one after the other."""
+        shared = {"n": wanted, "temperature": self.temperature, **self.limit}
+        if menu and self.think:
+            request = self._request(node, THINK_MENU)
+            return await think_and_choose(search.meter, search.base, node.state.schema, request, **shared)
+        request = self._request(node, NEXT_MENU if menu else NEXT_FREE)
+        return await sample_steps(search.meter, search.base, node.state.schema, request, imagined=imagined, **shared)
 
     async def _judge(self, search: Search, children: Sequence[Node], wanted: int) -> None:
         """Value of each state that is no end: `mix` of the judge's rating (0 to 1) and the share of samples."""
@@ -365,7 +377,7 @@ class LanguageAgentTreeSearch:
             action,
             rationale=best.note.thought,
             candidates=tuple((c.action, c.value) for c in children),
-            calls=(best.source,) if best.source else (),
+            calls=(*best.note.before, *((best.source,) if best.source else ())),
             turn=(action.text,),
             trace={**trace, "solved": bool(solved), **search.meter.trace()},
         )

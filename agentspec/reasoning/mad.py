@@ -8,6 +8,9 @@ would be copies of each other, and are refused.
 
 An answer is quoted within `quote_tokens`: reasons are clipped, the proposed action never is.
 
+An answer that names no action is asked for again at once, so that the others see one that does; all answers of a round
+together have `max_retries` further calls.
+
 In menu mode an answer is an argument in a call of its own and then the constrained choice, unless `argue` is off; the
 agents then exchange bare actions. Cost per step: agents x (1 + rounds) calls, twice that with arguments in menu mode.
 """
@@ -15,7 +18,7 @@ agents then exchange bare actions. Cost per step: agents x (1 + rounds) calls, t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -34,7 +37,7 @@ from agentspec.prompting import (
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.search.meter import Ask, Meter, last_resort
-from agentspec.reasoning.self_consistency import Tally, Vote, vote
+from agentspec.reasoning.self_consistency import Answered, Tally, Vote, votes_of
 from agentspec.types import ActionSchema, AgentInput, Decision, Recall
 
 PRESETS = {
@@ -81,13 +84,13 @@ class MultiAgentDebate(Stateless):
         sampling_temperature: temperature of the answers; above 0, or the advisers would be one.
         quote_tokens: most tokens quoted of one other answer; its action is always among them.
         thought_tokens: most tokens of an answer in words (`None`: the spec's `max_tokens`).
-        max_retries: further calls if no adviser names an action.
+        max_retries: further calls for answers that name no action, all of a round together.
     """
 
     declaration = Declaration(
         "agents answer, read each other's answers, answer again, and vote",
-        calls=CallProfile(step=(9, 20)),
-        rl=CallProfile(step=(4, 6)),
+        calls=CallProfile(step=(9, 24)),
+        rl=CallProfile(step=(4, 8)),
         purposes=Purpose.each("step", "argue", "act"),
     )
 
@@ -129,6 +132,7 @@ class MultiAgentDebate(Stateless):
         advisers = [Adviser(base) for _ in range(self.agents)]
         meter = Meter(self.services.llm)
         for number in range(self.rounds + 1):
+            meter.retries = self.max_retries
             if number:
                 self._show_others(advisers, schema)
             await self._answer(meter, advisers, schema)
@@ -137,7 +141,7 @@ class MultiAgentDebate(Stateless):
             if meter.exhausted:
                 break
         return self._vote(meter, advisers, schema) or await last_resort(
-            meter, base, schema, _trace(advisers, self.rounds), self.max_retries
+            meter, base, schema, _trace(advisers, self.rounds)
         )
 
     def _show_others(self, advisers: Sequence[Adviser], schema: ActionSchema) -> None:
@@ -164,11 +168,13 @@ class MultiAgentDebate(Stateless):
             if meter.exhausted:
                 return
         sampling = {"choices": schema.choices, "temperature": self.temperature} if schema.choices else self.limit
-        for i, call in enumerate(await meter.ask_all([Ask("act", a.messages, sampling, "explored") for a in advisers])):
+        asks = [Ask("act", a.messages, sampling, "explored") for a in advisers]
+        answers = [Answered(asks[i], call, 0, arguments[i]) for i, call in enumerate(await meter.ask_all(asks))]
+        for i, (vote, call, _) in enumerate(await votes_of(meter, answers, schema)):
             text = f"{words[i]}Action: {call.text}" if words[i] else call.text
             advisers[i].messages = (*advisers[i].messages, assistant(sampled(call)))
             advisers[i].texts.append(text)
-            advisers[i].votes.append(vote(call.text, text, schema, (*arguments[i], (call.id, 0))))
+            advisers[i].votes.append(replace(vote, rationale=text) if vote else None)
 
     def _vote(self, meter: Meter, advisers: Sequence[Adviser], schema: ActionSchema) -> Decision | None:
         """The majority of each agent's last answers; if none of them is legal, of the newest round that has one."""

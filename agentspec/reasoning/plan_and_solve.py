@@ -7,8 +7,8 @@ chain; in menu mode one call for plan and reasoning and one constrained choice.
 `persistent` is the form for agents whose plans shall outlive a step: a numbered list of sub-goals is made once, and
 every step works on the current one. A step that reports its sub-goal as done moves on to the next. A new plan is made
 when the plan is carried out, after `replan_failures` failed actions in a row (the planner is shown them), on news (the
-environment reports one of `replan_on` among its `events`, or what there is to do has changed), or every `replan_every`
-steps; and no plan is made before there is anything to see. One call per step, and one per plan.
+environment reports one of `replan_on` among its `events`), or every `replan_every` steps; and no plan is made before
+there is anything to see. One call per step, and one per plan.
 
 In the `conversation` layout a persistent plan and the planner's request are turns of the conversation, exactly as
 sampled, so an episode stays one token sequence; the plan is shown again when the conversation no longer holds it.
@@ -45,8 +45,8 @@ PRESETS = {
     "paper": {"persistent": False, "think": True, "plan_tokens": 512},
     "rl": {"persistent": True, "think": False, "plan_tokens": 96},
 }
-NEWS = ("new_offer", "new_offers", "arrived", "delivered", "failed", "depleted", "hospital", "charge_done")
-"""Events that call for a new plan by default."""
+NEWS = ("new_offer", "new_offers", "delivered", "failed", "depleted", "hospital", "out_of_money", "charge_done")
+"""Events that call for a new plan by default; having come where one wanted to go is none."""
 
 TOGETHER = "First understand the task and where things stand, and devise a plan.{plus} Then carry out its first step: "
 TOGETHER_FREE = "end with one line of the form\nAction: NAME(arguments)"

@@ -154,7 +154,7 @@ class ReasoningViaPlanning(Stateless):
         path_tokens: budgets of prompt sections.
         prediction_tokens: most tokens of a predicted observation.
         thought_tokens: most tokens of a proposed action (`None`: the spec's `max_tokens`).
-        max_retries: further calls if nothing that was proposed is an action.
+        max_retries: further calls for proposals of which none is an action, all of a decision together.
     """
 
     declaration = Declaration(
@@ -230,7 +230,7 @@ class ReasoningViaPlanning(Stateless):
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
-        meter = Meter(self.services.llm, **self.limits)
+        meter = Meter(self.services.llm, **self.limits, retries=self.max_retries)
         problem = ImaginedProblem(self, meter, base, input.action_schema)
         root = Node(state=root_outcome(input, None))
         record: list[tuple[float, list[Node]]] = []
@@ -248,7 +248,7 @@ class ReasoningViaPlanning(Stateless):
         leaf = self._output(root, record)
         action = legal(leaf.first.action, input.action_schema) if leaf else None
         if leaf is None or action is None:
-            return await last_resort(meter, base, input.action_schema, trace, self.max_retries)
+            return await last_resort(meter, base, input.action_schema, trace)
         children = root.children or []
         return Decision(
             action,

@@ -3,26 +3,35 @@
 The chains are samples of one prompt at a temperature above 0. What is counted are *canonical* actions, however they
 were written; an answer without a legal action has no vote; of equally frequent actions the one that came first wins. In
 menu mode every chain is followed by its own constrained choice, in a prompt that holds that chain alone.
+
+A chain that ends without an action is asked for again; all of them together have `max_retries` further calls.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from agentspec.actions import canonical
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, assistant, user
 from agentspec.parameters import at_least, settings
-from agentspec.prompting import MAX_RETRIES, MENU_ANSWER, require_variety, sampled, static_prompt, user_turn
+from agentspec.prompting import (
+    MAX_RETRIES,
+    MENU_ANSWER,
+    read_call,
+    require_variety,
+    sampled,
+    static_prompt,
+    user_turn,
+)
 from agentspec.protocols import Services
-from agentspec.reading import read
 from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.cot import THINK, THINK_THEN_CALL
-from agentspec.reasoning.search.meter import Ask, Meter, last_resort
+from agentspec.reasoning.search.meter import Ask, Meter, Unread, ask_again, last_resort
 from agentspec.registry import SpecError
-from agentspec.types import Action, ActionSchema, AgentInput, Decision, Recall
+from agentspec.types import Action, ActionSchema, AgentInput, Decision, LLMCall, Recall
 
 PRESETS = {"paper": {"samples": 5}, "rl": {"samples": 3}}
 
@@ -36,10 +45,43 @@ class Vote:
     calls: tuple[tuple[int, int], ...]
 
 
-def vote(text: str, rationale: str, schema: ActionSchema, calls: tuple[tuple[int, int], ...]) -> Vote | None:
-    """The vote of an answer; `None` if it holds no legal action."""
-    action = read(text, schema).action
-    return Vote(action, rationale, calls) if isinstance(action, Action) else None
+@dataclass(frozen=True)
+class Answered:
+    """An answer that should hold an action: the question, where it stands, and the completions and words before it."""
+
+    ask: Ask
+    call: LLMCall
+    completion: int = 0
+    before: tuple[tuple[int, int], ...] = ()
+    words: str = ""
+
+
+async def votes_of(
+    meter: Meter, answers: Sequence[Answered], schema: ActionSchema
+) -> list[tuple[Vote | None, LLMCall, int]]:
+    """The vote of each answer and the completion it stands in; `None` if it holds no action, asked again or not."""
+    readings = [read_call(a.call, schema, a.completion) for a in answers]
+    lost = [i for i, reading in enumerate(readings) if not isinstance(reading.action, Action)]
+    again = [Unread(_alone(answers[i].ask), answers[i].call, answers[i].completion) for i in lost]
+    found = await ask_again(meter, again, schema, lambda call: isinstance(read_call(call, schema).action, Action))
+    mended = dict(zip(lost, found, strict=True))
+    votes: list[tuple[Vote | None, LLMCall, int]] = []
+    for i, answer in enumerate(answers):
+        call, completion = answer.call, answer.completion
+        chain: tuple[tuple[int, int], ...] = ((call.id, completion),)
+        read_later = mended.get(i)
+        if read_later is not None:
+            (call, chain), completion = read_later, 0
+        action = read_call(call, schema, completion).action
+        rationale = answer.words or call.completions[completion].text
+        vote = Vote(action, rationale, (*answer.before, *chain)) if isinstance(action, Action) else None
+        votes.append((vote, call, completion))
+    return votes
+
+
+def _alone(ask: Ask) -> Ask:
+    """The same question for one sample."""
+    return replace(ask, sampling={**ask.sampling, "n": 1})
 
 
 @dataclass(frozen=True)
@@ -77,7 +119,7 @@ class SelfConsistency(Stateless):
         sampling_temperature: temperature of the chains; above 0, or they would not be independent.
         credit: which completions are credited as executed: those of the answer `returned`, or of the whole
             `majority`; the others are credited as explored.
-        max_retries: further calls if no chain holds an action.
+        max_retries: further calls for chains that hold no action, all of them together.
         thought_tokens: most tokens of a chain (`None`: the spec's `max_tokens`).
     """
 
@@ -119,7 +161,7 @@ class SelfConsistency(Stateless):
         messages = self.services.context.prompt(
             static_prompt(input, THINK if schema.choices else THINK_THEN_CALL), dynamic
         )
-        meter = Meter(self.services.llm)
+        meter = Meter(self.services.llm, retries=self.max_retries)
         answers = await (self._choose if schema.choices else self._answer)(meter, messages, schema)
         require_variety("self_consistency", self.services, self.sampling["temperature"])
         votes = [a for a in answers if a is not None]
@@ -131,7 +173,7 @@ class SelfConsistency(Stateless):
         }
         winner = tally.winner
         if winner is None:
-            return await last_resort(meter, messages, schema, trace, self.max_retries)
+            return await last_resort(meter, messages, schema, trace)
         credited = tally.groups[0] if self.credit == "majority" else (winner,)
         return Decision(
             winner.action,
@@ -144,14 +186,10 @@ class SelfConsistency(Stateless):
 
     async def _answer(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
         """Chain and action in one completion; `None` for an answer without a legal action."""
-        asked = await meter.ask_all(
-            [Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")]
-        )
-        answers: list[Vote | None] = []
-        for call in asked:
-            for i, completion in enumerate(call.completions):
-                answers.append(vote(completion.text, completion.text, schema, ((call.id, i),)))
-        return answers
+        ask = Ask("act", messages, {"n": self.samples, **self.sampling, **self.limit}, credit="explored")
+        asked = await meter.ask_all([ask])
+        answers = [Answered(ask, call, i) for call in asked for i in range(len(call.completions))]
+        return [vote for vote, _, _ in await votes_of(meter, answers, schema)]
 
     async def _choose(self, meter: Meter, messages: Sequence[Message], schema: ActionSchema) -> list[Vote | None]:
         """Chains as samples of one request, then one constrained choice after each of them, asked together."""
@@ -170,7 +208,8 @@ class SelfConsistency(Stateless):
             )
             for i in range(len(chains.completions))
         ]
-        answers: list[Vote | None] = []
-        for i, call in enumerate(await meter.ask_all(asks)):
-            answers.append(vote(call.text, chains.completions[i].text, schema, ((chains.id, i), (call.id, 0))))
-        return answers
+        answers = [
+            Answered(asks[i], call, 0, ((chains.id, i),), chains.completions[i].text)
+            for i, call in enumerate(await meter.ask_all(asks))
+        ]
+        return [vote for vote, _, _ in await votes_of(meter, answers, schema)]

@@ -17,6 +17,7 @@ Cost per step with the paper's sizes: 5 proposals and 15 judgements of 3 samples
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,7 +31,7 @@ from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.search.judge import last_amount, last_number, last_word
 from agentspec.reasoning.search.meter import Ask, Meter, OutOfBudgetError, last_resort
-from agentspec.reasoning.search.propose import legal, merge, read_steps
+from agentspec.reasoning.search.propose import legal, merge, read_steps, readable
 from agentspec.reasoning.search.tree import Node
 from agentspec.types import ActionSchema, AgentInput, Decision, LLMCall, Recall
 
@@ -111,7 +112,7 @@ class TreeOfThoughts(Stateless):
         max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
         course_tokens: budgets of prompt sections.
         thought_tokens: most tokens of a proposal or a judgement (`None`: the spec's `max_tokens`).
-        max_retries: further calls if nothing that was proposed is an action.
+        max_retries: further calls for proposals of which none is an action, all of a decision together.
     """
 
     declaration = Declaration(
@@ -177,7 +178,8 @@ class TreeOfThoughts(Stateless):
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         dynamic = user_turn(input, recall, self.services)
         base = self.services.context.prompt(static_prompt(input, ON_REQUEST), dynamic)
-        search = Search(base, input.action_schema, Meter(self.services.llm, **self.limits))
+        meter = Meter(self.services.llm, **self.limits, retries=self.max_retries)
+        search = Search(base, input.action_schema, meter)
         root = Node()
         # Out of budget: what was found until then decides, and the trace says so.
         with contextlib.suppress(OutOfBudgetError):
@@ -188,7 +190,7 @@ class TreeOfThoughts(Stateless):
         best = search.best()
         action = legal(best.first.action, input.action_schema) if best else None
         if best is None or action is None:
-            return await last_resort(search.meter, base, input.action_schema, trace, self.max_retries)
+            return await last_resort(search.meter, base, input.action_schema, trace)
         source = best.first.source
         return Decision(
             action,
@@ -234,10 +236,12 @@ class TreeOfThoughts(Stateless):
 
     async def _generate(self, search: Search, frontier: Sequence[Node]) -> list[Node]:
         """Continuations of all nodes of the frontier, asked together."""
-        calls = await search.meter.ask_all([self._generation(search, node) for node in frontier])
+        asks = [self._generation(search, node) for node in frontier]
+        calls = await search.meter.ask_all(asks)
         candidates: list[Node] = []
-        for node, call in zip(frontier, calls, strict=False):  # fewer answers when the budget ended among them
-            node.children = self._children(search, node, call)
+        for node, ask, call in zip(frontier, asks, calls, strict=False):  # fewer where the budget ended among them
+            children = functools.partial(self._children, search, node)
+            node.children = children(await readable(search.meter, ask, call, search.schema, children))
             if node.children:
                 search.grow(node.children)
                 candidates += node.children

@@ -150,6 +150,21 @@ def curves(
     return _finish(figure, name, caption)
 
 
+def routes(name: str, ways: Mapping[str, Sequence[tuple[float, float]]], *, caption: str) -> Figure:
+    """Ways on one plane: a ring at the start, a square at the end, a dot at every step."""
+    figure, axes = _figure(6.2, 5.2)
+    for i, (label, points) in enumerate(ways.items()):
+        x, y = [p[0] for p in points], [p[1] for p in points]
+        style = {"color": COLOURS[i % len(COLOURS)]}
+        axes.plot(x, y, linewidth=1.6, marker=".", markersize=4, linestyle=("-", "--")[i % 2], label=label, **style)
+        axes.plot(x[:1], y[:1], marker="o", markersize=9, markerfacecolor="none", **style)
+        axes.plot(x[-1:], y[-1:], marker="s", markersize=7, **style)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return _finish(figure, name, caption)
+
+
 def shares(
     name: str, groups: Sequence[str], parts: Mapping[str, Sequence[float]], *, heading: str, caption: str
 ) -> Figure:

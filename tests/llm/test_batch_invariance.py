@@ -231,7 +231,7 @@ def test_without_its_measures_the_engine_is_not_taken_for_invariant(monkeypatch:
     x, w = torch.randn(64, 64), torch.randn(128, 64)
     plain = [torch.nn.functional.linear(x[:n], w) for n in (1, 2, 3, 64)]
     differs = any(not torch.equal(p, plain[-1][: len(p)]) for p in plain)
-    monkeypatch.setattr("agentspec.llm.local.invariance._packs", lambda: False)
+    monkeypatch.setattr("agentspec.llm.local.invariance.packs", lambda: False)
     monkeypatch.setattr("agentspec.llm.local.forward._MIN_ROWS", {})
     monkeypatch.setattr("agentspec.llm.local.attention._QUERIES", {})
     monkeypatch.setattr(probe, "_KNOWN", {})

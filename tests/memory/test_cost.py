@@ -155,7 +155,11 @@ def test_a_method_that_was_measured_is_not_played_again(tmp_path: Path) -> None:
 
 def test_a_method_that_failed_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = {"steps": 2, "preset": "rl", "model": "scripted"}
-    monkeypatch.setattr("benchmarks.memory_cost.played", lambda settings, llm: {"failed": "no such city"})
+
+    async def fails(settings: object, llm: object) -> dict[str, str]:
+        return {"failed": "no such city"}
+
+    monkeypatch.setattr("benchmarks.memory_cost.play", fails)
     assert measure(["base"], given, tmp_path, llm=ScriptedLLM(answer)) == 1
     assert "failed: no such city" in (tmp_path / TABLE).read_text()
     monkeypatch.undo()

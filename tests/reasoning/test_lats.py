@@ -20,12 +20,18 @@ from tests.reasoning.numbers_env import NUMBERS, ONE_WAY, NumbersEnv
 from tests.reasoning.player import OPERATIONS, credits_of, last, named, play, purposes, seen, solved
 from tests.reasoning.test_rap import imaginer
 
+THOUGHT = "Smaller numbers double better."
+
 
 def climber(request: Request):
     """Proposes everything; rates a state by how near it is to the target, which misleads."""
     if request.tag.purpose == "propose":
         names = [named(name, request) for name in OPERATIONS]
+        if len(request.messages) > 2 and request.messages[-2].text == THOUGHT:
+            return names[request.id % len(names)]  # a choice after a thought is asked for alone
         return (names * request.sampling.n)[: request.sampling.n]
+    if request.tag.purpose == "think":
+        return THOUGHT
     number, target, _ = seen(last(request))
     if request.tag.purpose == "reflect":
         return f"Ending at {number} was wrong."
@@ -160,3 +166,24 @@ def test_the_model_world_can_be_chosen_where_snapshots_exist() -> None:
     trajectory, requests = play(climber, {"reasoning": {"name": "lats", "world": "model"}}, env=NUMBERS, menu=True)
     assert "world" in purposes(requests)
     assert trajectory.transitions[0].decision.trace["world"] == "model"
+
+
+def test_with_a_menu_thoughts_are_part_of_the_nodes() -> None:
+    """A thought is asked for before the choice, stands in the course under judgement, and is credited with it."""
+
+    trajectory, requests = play(
+        climber, {"reasoning": {"name": "lats", "preset": "rl", "num_iterations": 9, "think": True}}, menu=True
+    )
+    assert solved(trajectory)
+    decision = trajectory.transitions[0].decision
+    assert decision.rationale == THOUGHT
+    assert len(decision.calls) == 2 and credits_of(trajectory, "think").count("executed") == len(trajectory.transitions)
+    chosen = next(r for r in requests if r.tag.purpose == "propose")
+    assert chosen.sampling.choices and chosen.messages[-2].text == THOUGHT
+    judged = next(r for r in requests if r.tag.purpose == "value")
+    assert f"(thought: {THOUGHT})" in judged.messages[-1].text
+
+
+def test_the_small_preset_chooses_from_a_menu_at_once() -> None:
+    _, requests = play(climber, {"reasoning": {"name": "lats", "preset": "rl"}}, menu=True, steps=1)
+    assert "think" not in {r.tag.purpose for r in requests}

@@ -75,14 +75,16 @@ def test_a_lone_agent_checks_its_own_answer() -> None:
 
 def test_ties_go_to_the_first_and_illegal_answers_do_not_vote() -> None:
     answers = iter(["DOUBLE()", "ADD()", "hm", "SUB()", "ADD()", "hm"])
-    trajectory, _ = play(lambda r: f"Action: {next(answers)}", {"reasoning": {"name": "mad", "num_rounds": 1}}, steps=1)
+    spec = {"reasoning": {"name": "mad", "num_rounds": 1, "max_retries": 0}}
+    trajectory, _ = play(lambda r: f"Action: {next(answers)}", spec, steps=1)
     assert trajectory.transitions[0].action_text == "SUB()"  # 1:1 in the last round
     assert trajectory.transitions[0].decision.valid
 
 
 def test_an_illegal_last_round_falls_back_flagged() -> None:
     answers = iter(["Action: DOUBLE()", "x", "x", "x", "x", "x"])
-    trajectory, _ = play(lambda r: next(answers), {"reasoning": {"name": "mad", "num_rounds": 1}}, steps=1)
+    spec = {"reasoning": {"name": "mad", "num_rounds": 1, "max_retries": 0}}
+    trajectory, _ = play(lambda r: next(answers), spec, steps=1)
     decision = trajectory.transitions[0].decision
     assert decision.action.name == "DOUBLE" and not decision.valid and "round 0" in decision.trace["fallback"]
 

@@ -12,7 +12,7 @@ from agentspec.llm.base import Request
 from agentspec.llm.recorder import ModuleLLM, Recorder
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.prompting import Step, course, quote
-from agentspec.reasoning.self_consistency import Tally, vote
+from agentspec.reasoning.self_consistency import Tally, Vote
 from agentspec.registry import SpecError
 from agentspec.services import Services, StepClock
 from agentspec.types import ActionSchema, ActionSpec, Parameter
@@ -50,8 +50,8 @@ def test_three_spellings_of_one_move_outvote_two_looks_at_the_board() -> None:
         'MOVE(x=120.2, y=-48, pace="normal")',
         "MOVE(120.0, -48.1)",
     ]
-    votes = [vote(text, text, MOVES, ((i, 0),)) for i, text in enumerate(texts)]
-    tally = Tally.of([v for v in votes if v], MOVES)
+    votes = [Vote(parse_action(text, MOVES), text, ((i, 0),)) for i, text in enumerate(texts)]
+    tally = Tally.of(votes, MOVES)
     assert tally.winner.action.name == "MOVE" and [len(g) for g in tally.groups] == [3, 2]
 
 

@@ -164,3 +164,14 @@ def test_state_survives_a_snapshot() -> None:
     agent.reasoning.restore(blob)
     assert agent.reasoning.snapshot() == blob
     assert set(OPERATIONS) == {"ADD", "DOUBLE", "SUB"}
+
+
+def test_to_have_come_where_one_wanted_to_go_is_no_news() -> None:
+    agent = AgentSpec.from_data({"reasoning": PERSISTENT}).build(Recorder(ScriptedLLM(["x"]), episode="e", seed=0))
+    method, here = agent.reasoning, AgentInput("", "", ActionSchema({}), {"offers": [1]})
+    method._plan, method._goals = "1. a", ["a"]
+    for event, due in (("arrived", False), ("picked_up", False), ("new_offers", True), ("hospital", True)):
+        method._news = ""
+        decision = Decision(Action("A", text="A()"))
+        asyncio.run(method.observe(Transition(0, here, decision, "A()", 0.0, "", info={"events": [event]})))
+        assert (method._reason_to_plan(here) is not None) is due, event

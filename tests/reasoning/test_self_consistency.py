@@ -6,10 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agentspec.actions import parse_action
 from agentspec.llm.base import Request
-from agentspec.reasoning.self_consistency import Tally, vote
+from agentspec.reasoning.self_consistency import Tally, Vote
 from agentspec.registry import SpecError
-from agentspec.types import ActionSchema
+from agentspec.types import Action, ActionSchema
 from tests.reasoning.numbers_env import ACTIONS, MENU
 from tests.reasoning.player import credits_of, greedy_player, named, play, seen, solve, solved
 
@@ -18,8 +19,8 @@ SPELLINGS = ["ADD()", " add( )", "```\nADD()\n```", "DOUBLE()", "Action: double(
 
 
 def tally(texts: list[str]) -> Tally:
-    votes = [vote(text, text, SCHEMA, ((i, 0),)) for i, text in enumerate(texts)]
-    return Tally.of([v for v in votes if v is not None], SCHEMA)
+    read = [(i, text, parse_action(text, SCHEMA)) for i, text in enumerate(texts)]
+    return Tally.of([Vote(a, text, ((i, 0),)) for i, text, a in read if isinstance(a, Action)], SCHEMA)
 
 
 @given(st.lists(st.sampled_from(SPELLINGS), max_size=9), st.randoms(use_true_random=False))

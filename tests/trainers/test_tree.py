@@ -25,7 +25,6 @@ def test_a_fork_is_stored_once() -> None:
     assert tree.positions == [0, 1, 2, 3, 2]
     assert tree.places == [[0, 1, 2, 3], [0, 1, 4], [0, 1]]
     assert [n.path for n in tree.nodes] == [(), (0,), (0,)]
-    assert tree.packing_ratio == 9 / 5
 
 
 def test_long_runs_become_chains() -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from agentspec.registry import SpecError
+from trainers.frozen import language_model, replaced
 from trainers.logprobs import sampled_logprobs
 from trainers.tree.attention import register
 from trainers.tree.trie import Tree, build_tree
@@ -29,7 +31,7 @@ HEAD_CHUNK = 1024
 class Wanted:
     """Trained tokens whose log-probability is wanted, one entry per (row, position).
 
-    `before` is the packed place of the token before it (whose logits decide it).
+    `before` is the place, in a forward's inputs flattened, of the token before it (whose logits decide it).
     """
 
     before: torch.Tensor
@@ -53,8 +55,7 @@ def enable_tree(model: nn.Module) -> None:
     Raises:
         SpecError: an architecture the packed forward does not compute exactly (checked on a few tokens).
     """
-    wrapper: Any = model
-    base: Any = wrapper.get_base_model() if hasattr(model, "get_base_model") else model
+    base = language_model(model)
     if getattr(base, "_agentspec_tree", False):
         return
     register(base)
@@ -65,17 +66,40 @@ def enable_tree(model: nn.Module) -> None:
     def forward(self: Any, *args: Any, tree: Tree | None = None, wanted: Wanted | None = None, **kwargs: Any) -> Any:
         if tree is None or wanted is None:
             return original(*args, **kwargs)
-        for name in ("attention_mask", "labels", "inputs_embeds", "use_cache"):
+        for name in ("labels", "inputs_embeds", "use_cache"):
             kwargs.pop(name, None)  # wrappers (PEFT) pass these along as None
-        # A four-dimensional mask is passed on untouched: no (N, N) mask is built, and ours does not read it.
-        nothing = torch.empty(1, 1, 1, 1, device=wanted.before.device)
-        hidden = self.base_model(*args, attention_mask=nothing, use_cache=False, tree=tree, **kwargs)
+        with last_layer_at(self.base_model, wanted.before):
+            hidden = self.base_model(*args, use_cache=False, tree=tree, **kwargs)
         output: TreeOutput = self.get_output_embeddings()(hidden.last_hidden_state[0][wanted.before], wanted=wanted)
         return output
 
     base.forward = types.MethodType(forward, base)
     base._agentspec_tree = True
     _check(model, base)
+
+
+@contextmanager
+def last_layer_at(decoder: Any, places: torch.Tensor) -> Iterator[None]:
+    """Inside, the last layer computes queries and everything after attention at `places` of the packed row only.
+
+    Nothing is read elsewhere, where zeros stand. Where the layer is recomputed backward, all of it is computed.
+    """
+    last = (getattr(decoder, "layers", None) or [None])[-1]
+    if last is None or getattr(last, "gradient_checkpointing", False):
+        yield
+        return
+    index = places.unique()
+    attention, mlp = getattr(last, "self_attn", None), getattr(last, "mlp", None)
+    modules = [getattr(attention, "q_proj", None), getattr(attention, "o_proj", None)]
+    modules += [mlp] if hasattr(mlp, "down_proj") else []  # of a mixture of experts, all is computed
+    with replaced({m: functools.partial(_at, m.forward, index) for m in modules if m is not None}):
+        yield
+
+
+def _at(forward: Callable[..., torch.Tensor], index: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """`forward` of x (1, N, in) at the places of `index`, zeros elsewhere: (1, N, out)."""
+    out = forward(x.index_select(1, index))
+    return out.new_zeros(1, x.shape[1], out.shape[-1]).index_copy(1, index, out)
 
 
 def _enable_head(model: Any) -> None:
@@ -124,11 +148,14 @@ def _check(model: nn.Module, base: Any) -> None:
     device = next(base.parameters()).device
     tree = build_tree(pair)
     trained = [(r, p) for r, s in enumerate(pair) for p in range(1, len(s))]
+    before, tokens = zip(*((tree.places[r][p - 1], pair[r][p]) for r, p in trained), strict=True)
+    ones = torch.ones(len(trained), device=device)
+    wanted = Wanted(torch.tensor(before).to(device), torch.tensor(tokens).to(device), ones, (None,) * len(trained))
     training = model.training
     model.eval()
     try:
         with torch.no_grad():
-            got = model(**packed_inputs(tree, device), **wanted_tokens(tree, pair, trained, device)).log_probs
+            got = model(**packed_inputs(tree, device), wanted=wanted).log_probs
             plain = [base(input_ids=torch.tensor([s], device=device), use_cache=False).logits[0].float() for s in pair]
     finally:
         model.train(training)
@@ -143,26 +170,11 @@ def _check(model: nn.Module, base: Any) -> None:
 
 
 def packed_inputs(tree: Tree, device: torch.device) -> dict[str, Any]:
-    """The model's token inputs for a tree: ids and positions, both (1, N)."""
+    """The inputs for a tree, of a model or of its decoder: ids and positions, both (1, N), and the tree itself."""
     return {
         "input_ids": torch.tensor([tree.tokens], device=device),
         "position_ids": torch.tensor([tree.positions], device=device),
+        # A four-dimensional mask is passed on untouched: no (N, N) mask is built, and ours does not read it.
+        "attention_mask": torch.empty(1, 1, 1, 1, device=device),
+        "tree": tree,
     }
-
-
-def wanted_tokens(
-    tree: Tree,
-    sequences: Sequence[Sequence[int]],
-    trained: Sequence[tuple[int, int]],
-    device: torch.device,
-    temperatures: Sequence[float] | None = None,
-    allowed: Sequence[tuple[int, ...] | None] | None = None,
-) -> dict[str, Any]:
-    """The packed forward's own arguments for (row, position) pairs; defaults: temperature 1, no constraint."""
-    wanted = Wanted(
-        before=torch.tensor([tree.places[r][p - 1] for r, p in trained], dtype=torch.long, device=device),
-        tokens=torch.tensor([sequences[r][p] for r, p in trained], dtype=torch.long, device=device),
-        temperatures=torch.tensor(list(temperatures or [1.0] * len(trained)), device=device),
-        allowed=tuple(allowed or [None] * len(trained)),
-    )
-    return {"tree": tree, "wanted": wanted}

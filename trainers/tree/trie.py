@@ -12,7 +12,7 @@ import torch
 from agentspec.tokens import shared_prefix
 from trainers.tree.flex import block_mask, subtree_ends
 
-NODE_TOKENS = 512
+NODE_TOKENS = 256
 """Longest node: a longer run of tokens becomes a chain of nodes, so that few queries see keys of their future."""
 
 
@@ -37,11 +37,6 @@ class Tree:
     nodes: list[Node] = field(default_factory=list)
     places: list[list[int]] = field(default_factory=list)
     masks: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
-
-    @property
-    def packing_ratio(self) -> float:
-        """Tokens of all sequences per token computed."""
-        return sum(map(len, self.places)) / max(1, len(self.tokens))
 
     @functools.cached_property
     def lengths(self) -> list[int]:

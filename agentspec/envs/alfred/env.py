@@ -25,16 +25,16 @@ from agentspec.envs.thor.game import Game, Told, check
 from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
 from agentspec.envs.thor.names import Names, direction, whereabouts
-from agentspec.envs.thor.protocol import Event
+from agentspec.envs.thor.protocol import Event, Thor
 from agentspec.envs.thor.scene import Scene
-from agentspec.envs.thor.sight import Camera
+from agentspec.envs.thor.sight import AGENT_HEIGHT, Camera
 from agentspec.envs.thor.ways import way_to_see
 from agentspec.metrics import Metric
 from agentspec.types import Action, ActionSchema
 
-SETTINGS = Settings(look_step=15.0, horizon=(-30.0, 60.0), camera=Camera(1.65, 60.0))
-"""ALFRED's: 0.25 m, 90 degrees, 15 degrees, 300 x 300 pixels, 1.5 m. Camera height and field of view (60 degrees) are
-those that explain best where the recorded pictures show the objects that experts pick up."""
+SETTINGS = Settings(look_step=15.0, horizon=(-30.0, 60.0), camera=Camera(AGENT_HEIGHT, 60.0))
+"""ALFRED's: 0.25 m, 90 degrees, 15 degrees, 300 x 300 pixels, 1.5 m. Camera height and field of view are the build's
+defaults; they also explain best where the recorded pictures show the objects that experts pick up."""
 
 RULES = """You act in a room of a house, one action at a time. Only objects within 1.5 m that the camera shows can be \
 used; you see them listed. Moves are 0.25 m, turns 90 degrees, the camera looks up or down by 15 degrees.
@@ -62,10 +62,13 @@ class AlfredEnv(Game):
         end_on_success: end when all goal conditions are met; else only `STOP()` ends.
         images: put the egocentric picture into the observation, uint8 (300, 300, 3).
         render_mode: None or "rgb_array".
+        player: `offline`, or `ai2thor`: the simulator, version 2.1.0.
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
 
     Raises:
         ValueError: an argument that is none of these.
         NoData: public data that are not where the paths say.
+        NoSimulator: at reset, with the player `ai2thor`: it cannot be started.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -102,17 +105,27 @@ class AlfredEnv(Game):
         end_on_success: bool = True,
         images: bool = False,
         render_mode: str | None = None,
+        player: Literal["offline", "ai2thor"] = "offline",
+        executable: str = "",
     ) -> None:
         check("suite", suite, ("own", "paper"))
         check("action_mode", action_mode, ("native", "menu"))
         if (suite == "paper" or trial_file) and not data:
             raise ValueError("data is empty; give the folder with ALFRED's json files (that has valid_unseen)")
-        pixels = (SETTINGS.width, SETTINGS.height)
-        super().__init__(max_steps=max_steps, images=images, pixels=pixels, render_mode=render_mode)
-        self._suite, self._task, self._trial_number, self._file = suite, task, trial, trial_file
-        self._data, self._annotation = data, annotation
         self._objects = objects or str(Path(data).parent / "objects")
         self._layouts = layouts or str(Path(data).parent / "layouts")
+        super().__init__(
+            max_steps=max_steps,
+            images=images,
+            settings=SETTINGS,
+            render_mode=render_mode,
+            player=player,
+            version="2.1.0",
+            executable=executable,
+            folders={"trials": data, "objects": self._objects, "layouts": self._layouts} if data else {},
+        )
+        self._suite, self._task, self._trial_number, self._file = suite, task, trial, trial_file
+        self._data, self._annotation = data, annotation
         self._menu, self._end_on_success = action_mode == "menu", end_on_success
 
     # -- the episode -------------------------------------------------------------------------------------------
@@ -133,7 +146,8 @@ class AlfredEnv(Game):
 
     def _begin(self, seed: int) -> None:
         self.trial = self.trial_of(seed)
-        self.world = start(self.trial, self._scene(self.trial))
+        self.world = self._open(self.trial.scene, lambda: self._scene(self.trial))
+        set_up(self.world, self.trial)
         self.changes, self.names, self.known = Changes(), Names(), set[str]()
         self._ways: dict[tuple[Any, ...], bool] = {}
         self._look(self.world.observe())
@@ -159,10 +173,11 @@ class AlfredEnv(Game):
     def reachable(self, one: Mapping[str, Any]) -> bool:
         """Whether there is a way to see an object; found once for where it is."""
         at = one["position"]
-        shut = any(b.closed for b in self.world.state.bodies.values() if b.id in (one["parentReceptacles"] or ()))
+        boxes = self.world.boxes()
+        shut = any(b.closed for b in boxes.state.bodies.values() if b.id in (one["parentReceptacles"] or ()))
         key = (one["objectId"], at["x"], at["y"], at["z"], shut)
         if key not in self._ways:
-            self._ways[key] = way_to_see(self.world, self.world.state.bodies[one["objectId"]]) is not None
+            self._ways[key] = way_to_see(boxes, boxes.state.bodies[one["objectId"]]) is not None
         return self._ways[key]
 
     def _over(self) -> bool:
@@ -268,12 +283,18 @@ class AlfredEnv(Game):
 
 
 def start(trial: Trial, scene: Scene, settings: Settings = SETTINGS) -> OfflineThor:
-    """A world set up for a trial, in ALFRED's order: dirt, switches, objects, the agent.
+    """An offline world set up for a trial; raises as `set_up`."""
+    world = OfflineThor(scene, settings)
+    set_up(world, trial)
+    return world
+
+
+def set_up(world: Thor, trial: Trial) -> None:
+    """Bring a world to where a trial starts, in ALFRED's order: dirt, switches, objects, the agent.
 
     Raises:
         ValueError: the trial does not fit the scene.
     """
-    world = OfflineThor(scene, settings)
     todo: list[Mapping[str, Any]] = []
     if trial.dirty:
         todo += [
@@ -288,8 +309,7 @@ def start(trial: Trial, scene: Scene, settings: Settings = SETTINGS) -> OfflineT
     for action in todo:
         event = world.step(action)
         if not event.success:
-            raise ValueError(f"trial {trial.id} does not fit scene {scene.name}: {action['action']}: {event.error}")
-    return world
+            raise ValueError(f"trial {trial.id} does not fit scene {trial.scene}: {action['action']}: {event.error}")
 
 
 def _worded(told: Mapping[str, Any]) -> str:

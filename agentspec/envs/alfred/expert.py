@@ -30,7 +30,8 @@ class Expert:
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         taken = inspect.signature(AlfredEnv.__init__).parameters
-        self._options = {k: v for k, v in options.items() if k in taken} | {"images": False, "render_mode": None}
+        own = {"images": False, "render_mode": None, "player": "offline", "executable": ""}
+        self._options = {k: v for k, v in options.items() if k in taken} | own
         self._twin: AlfredEnv | None = None
 
     def act(self, info: Mapping[str, Any]) -> str:
@@ -42,7 +43,7 @@ class Expert:
             return "stop" if menu else "STOP()"
         call, object_id = goal
         name = env.names.name(object_id)
-        way = way_to_see(env.world, env.world.state.bodies[object_id])
+        way = way_to_see(env.world.boxes(), env.world.boxes().state.bodies[object_id])
         if way is None:
             return "stop" if menu else "STOP()"
         if menu:
@@ -53,7 +54,7 @@ class Expert:
 
     def _towards(self, env: AlfredEnv, object_id: str) -> str:
         """On the menu: the way to what an object is in or on, which makes the object known."""
-        parents = env.world.state.bodies[object_id].parents
+        parents = env.world.boxes().state.bodies[object_id].parents
         ways = [f"go to {env.names.name(p)}" for p in parents]
         return next((way for way in ways if way in env.offered), "stop")
 
@@ -87,7 +88,8 @@ class _Mind:
     """One decision: the state read once, and the rules of the task types."""
 
     def __init__(self, env: AlfredEnv) -> None:
-        self.env, self.state, self.targets = env, env.world.state, env.trial.targets
+        self.env, self.boxes, self.targets = env, env.world.boxes(), env.trial.targets
+        self.state = self.boxes.state
         self.held = self.state.held()
         self.goal = piece(self.targets.object) if self.targets.sliced else self.targets.object
 
@@ -116,7 +118,7 @@ class _Mind:
         best: tuple[int, str] | None = None
         for one in bodies:
             shut = self._shut(one)
-            way = way_to_see(self.env.world, shut or one)
+            way = way_to_see(self.boxes, shut or one)
             if way is not None:
                 cost = (len(way) + (1 if shut else 0), one.id)
                 best = cost if best is None or cost < best else best

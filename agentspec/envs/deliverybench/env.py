@@ -28,7 +28,7 @@ from gymnasium import spaces
 
 from agentspec.envs.deliverybench import STEP_LIMIT
 from agentspec.envs.deliverybench.city.generate import city_of
-from agentspec.envs.deliverybench.outcome import MAX_ACTION, Last, plan_of
+from agentspec.envs.deliverybench.outcome import MAX_ACTION, Last
 from agentspec.envs.deliverybench.view.cards import OfferCards, describe, state_hash
 from agentspec.envs.deliverybench.view.compact import compact_text, menu_text
 from agentspec.envs.deliverybench.view.full import around, full_text
@@ -40,6 +40,7 @@ from agentspec.envs.deliverybench.world.grammar import advertised, understood
 from agentspec.envs.deliverybench.world.rules import Rules, rules_named
 from agentspec.envs.deliverybench.world.thinking import ThinkTime
 from agentspec.metrics import Metric
+from agentspec.shapes import plan_of
 from agentspec.types import ActionError, ActionSchema
 
 CHARSET = string.printable

@@ -1,15 +1,12 @@
-"""What the last step left for the next observation, and the plan that an answer carried along."""
+"""What the last step left for the next observation."""
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from agentspec.envs.deliverybench.world.engine import Outcome
 
 MAX_ACTION = 512
-MAX_PLAN = 500
-PLAN_KEYS = ("plan", "future_plan")
 
 
 class Last:
@@ -64,16 +61,3 @@ class Last:
     def dump(self) -> dict[str, Any]:
         """The constructor's arguments as JSON values."""
         return {name: getattr(self, name) for name in self.__slots__}
-
-
-def plan_of(text: str) -> str:
-    """The plan in an answer like `{"action": "WAIT(60)", "plan": "then fetch order 3"}`; "" where there is none."""
-    start = text.find("{")
-    if start < 0 or not any(key in text for key in PLAN_KEYS):
-        return ""
-    try:
-        data = json.loads(text[start : text.rindex("}") + 1])
-    except (ValueError, RecursionError):
-        return ""
-    plans = [data[key] for key in PLAN_KEYS if isinstance(data, dict) and isinstance(data.get(key), str)]
-    return " ".join(plans[0].split())[:MAX_PLAN] if plans else ""

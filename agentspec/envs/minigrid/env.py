@@ -254,8 +254,8 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
             self.close()
             self._env = gymnasium.make(layout.id, disable_env_checker=True, max_steps=self.max_steps)
         self.layout = layout
-        first, _ = self._env.reset(seed=layout.seed)
-        self._view = look(self.world, first["image"])
+        self._env.reset(seed=layout.seed)
+        self._view = look(self.world)
         self._history = []
         self._terminated = self._truncated = False
         self._return = 0.0
@@ -268,9 +268,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         if number == NO_ACTION:
             world.step_count += 1
         else:
-            seen, paid, terminated, _, _ = world.step(number)
+            world.gen_obs = _no_picture  # the symbolic view that `step` would make is not used
+            try:
+                _, paid, terminated, _, _ = world.step(number)
+            finally:
+                del world.gen_obs
             self._terminated, reward = bool(terminated), float(paid)
-            self._view = look(world, seen["image"])
+            self._view = look(world)
         self._return += reward
         self._truncated = not self._terminated and world.step_count >= self.max_steps
         return reward
@@ -313,6 +317,10 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         steps = int(self.world.step_count)
         best = layout.optimal if layout.optimal is not None else optimum(layout.id, layout.seed, MOST_STATES)
         return {} if best is None else {"efficiency": best / max(steps, best), "optimal_steps": float(best)}
+
+
+def _no_picture() -> dict[str, Any]:
+    return {}
 
 
 @dataclass(frozen=True)

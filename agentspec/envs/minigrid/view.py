@@ -1,6 +1,7 @@
 """What an agent sees of a grid, in words: everything from the 7 x 7 cells in front of it, nothing else.
 
-`look` reads MiniGrid's own partial observation (`gen_obs`, walls occlude) into a `View`; three texts are made of it:
+`look` reads the cells that MiniGrid's own partial observation shows (walls occlude) into a `View`; three texts are made
+of it:
 
 - `compact`: one short line per aspect, at most 80 tokens of a small model's vocabulary on the suites offered;
 - `basic`: sentences, one per thing seen;
@@ -11,16 +12,18 @@ Distances are steps: "2 forward, 1 left". Unseen cells are never described.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX, STATE_TO_IDX
+from minigrid.core.world_object import Wall
 
 HEADINGS = ("east", "south", "west", "north")
-TYPES = {index: name for name, index in OBJECT_TO_IDX.items()}
-COLOURS = {index: name for name, index in COLOR_TO_IDX.items()}
-STATES = {index: name for name, index in STATE_TO_IDX.items()}
+AHEAD = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""One step ahead by heading: x to the east, y to the south."""
+OUTSIDE = Wall()
+"""Beyond the grid there is wall."""
 PICKABLE = frozenset({"key", "ball", "box"})
 MARKS = {
     **{"unseen": "?", "agent": "?", "empty": ".", "floor": ".", "wall": "#", "lava": "L"},
@@ -29,12 +32,11 @@ MARKS = {
 """Characters of the relational map; the agent is `^`, an open door `_`."""
 LEGEND = "you are ^ and look up; # wall, . free, ? unseen, D door, _ open door, K key, O ball, B box, G goal, L lava"
 PLAIN = frozenset({"unseen", "empty", "wall", "floor", "agent"})
-UNSEEN = OBJECT_TO_IDX["unseen"]
 MOST_SHOWN = 3
 """Things, or rows of equal things, that the compact text names."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Thing:
     """An object in view: `forward` and `right` are steps (`right` negative: to the left)."""
 
@@ -76,7 +78,7 @@ class View:
         ahead: the thing in the cell in front, walls included; `None` for an empty cell.
         things: objects in view (no walls, no floor), nearest first.
         walls: steps to the nearest visible wall ahead, left and right; 0 where none is in view.
-        rows: the character map, far row first.
+        cells: types of the cells by rows, the agent's own row first, each from left to right.
     """
 
     mission: str
@@ -85,7 +87,19 @@ class View:
     ahead: Thing | None
     things: tuple[Thing, ...]
     walls: tuple[int, int, int]
-    rows: tuple[str, ...]
+    cells: tuple[tuple[str, ...], ...]
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The character map, far row first."""
+        size = len(self.cells[0])
+        drawn = [[MARKS[kind] for kind in row] for row in self.cells]
+        drawn += [["?"] * size for _ in range(size - len(drawn))]
+        for thing in self.things:
+            if thing.type == "door" and thing.state == "open":
+                drawn[thing.forward][thing.right + size // 2] = "_"
+        drawn[0][size // 2] = "^"
+        return tuple("".join(row) for row in reversed(drawn))
 
     @property
     def affordances(self) -> tuple[str, ...]:
@@ -105,50 +119,97 @@ class View:
         return tuple(allowed)
 
 
-def look(grid: Any, image: Any = None) -> View:
+def look(world: Any) -> View:
     """What the agent of a running MiniGrid environment (`env.unwrapped`) sees.
 
-    Args:
-        image: the symbolic view that the last step returned, uint8 (7, 7, 3); default: looks now.
+    The same cells as in MiniGrid's own partial observation (`gen_obs`), read from the grid row by row: sight goes
+    forward, and to the sides and diagonals from every cell that lets it through.
     """
-    seen = (grid.gen_obs()["image"] if image is None else image).tolist()
-    size = len(seen)
-    middle, bottom = size // 2, size - 1
+    size = world.agent_view_size
+    middle = size // 2
+    grid, width, height = world.grid.grid, world.grid.width, world.grid.height
+    ahead_x, ahead_y = AHEAD[world.agent_dir]
+    x0, y0 = int(world.agent_pos[0]), int(world.agent_pos[1])
+    everything = world.see_through_walls
     things: list[Thing] = []
-    kinds: dict[tuple[int, int], str] = {}
-    rows = [["?"] * size for _ in range(size)]
-    for column, cells in enumerate(seen):
-        for row, (kind, colour, state) in enumerate(cells):
-            if kind == UNSEEN or (column == middle and row == bottom):
-                continue  # the agent's own cell shows what it carries
-            name = TYPES[kind]
-            kinds[bottom - row, column - middle] = name
-            rows[row][column] = MARKS[name]
-            if name not in PLAIN:
-                thing = Thing(name, COLOURS[colour], STATES[state], bottom - row, column - middle)
-                things.append(thing)
-                if name == "door" and thing.state == "open":
-                    rows[row][column] = "_"
-    rows[bottom][middle] = "^"
-    things.sort(key=lambda t: (t.distance, abs(t.right), t.right))
-    ahead = next((t for t in things if t.forward == 1 and t.right == 0), None)
-    if kinds.get((1, 0)) == "wall":
-        ahead = Thing("wall", "", "", 1, 0)
+    rows: list[list[str]] = []
+    lit = (1 << size) - 1 if everything else 1 << middle
+    for forward in range(size):
+        x, y = x0 + forward * ahead_x + middle * ahead_y, y0 + forward * ahead_y - middle * ahead_x
+        cells = []
+        clear = 0
+        for bit in range(size):
+            cell = grid[y * width + x] if 0 <= x < width and 0 <= y < height else OUTSIDE
+            cells.append(cell)
+            if cell is None or cell.see_behind():
+                clear |= 1 << bit
+            x -= ahead_y
+            y += ahead_x
+        seen, lit = (lit, lit) if everything else _spread(lit, clear, size)
+        row = []
+        for bit, cell in enumerate(cells):
+            if not seen >> bit & 1:
+                row.append("unseen")
+            elif cell is None:
+                row.append("empty")
+            else:
+                row.append(cell.type)
+                if cell.type not in PLAIN and (forward or bit != middle):
+                    things.append(Thing(cell.type, cell.color, _state(cell), forward, bit - middle))
+        rows.append(row)
+        if not lit:
+            break
+    things.sort(key=_nearness)
+    ahead = Thing("wall", "", "", 1, 0) if len(rows) > 1 and rows[1][middle] == "wall" else None
+    for thing in things:
+        if thing.forward == 1 and thing.right == 0:
+            ahead = thing
+    carried = world.carrying
     return View(
-        mission=grid.mission,
-        heading=HEADINGS[int(grid.agent_dir)],
-        carrying=f"{grid.carrying.color} {grid.carrying.type}" if grid.carrying else "",
+        mission=world.mission,
+        heading=HEADINGS[int(world.agent_dir)],
+        carrying=f"{carried.color} {carried.type}" if carried else "",
         ahead=ahead,
         things=tuple(things),
-        walls=(_wall(kinds, 1, 0, size), _wall(kinds, 0, -1, size), _wall(kinds, 0, 1, size)),
-        rows=tuple("".join(row) for row in rows),
+        walls=(
+            _wall([row[middle] for row in rows[1:]]),
+            _wall(rows[0][middle - 1 :: -1]),
+            _wall(rows[0][middle + 1 :]),
+        ),
+        cells=tuple(map(tuple, rows)),
     )
 
 
-def _wall(kinds: Mapping[tuple[int, int], str], forward: int, right: int, size: int) -> int:
+@functools.lru_cache(maxsize=1 << 14)
+def _spread(lit: int, clear: int, size: int) -> tuple[int, int]:
+    """From the cells of a row that light reaches and those it passes: all cells seen in it, and those of the next row.
+
+    Bit i is the i-th cell from the left. Light passes from a clear cell to its neighbours and to the three before it.
+    """
+    whole, before = (1 << size) - 1, 0
+    while lit != before:
+        before = lit
+        through = lit & clear
+        lit |= (through << 1 | through >> 1) & whole
+    through = lit & clear
+    return lit, (through | through << 1 | through >> 1) & whole
+
+
+def _state(cell: Any) -> str:
+    """The state of a door; other things have none to tell."""
+    if cell.type != "door":
+        return ""
+    return "open" if cell.is_open else "locked" if cell.is_locked else "closed"
+
+
+def _nearness(thing: Thing) -> tuple[int, int, int]:
+    side = abs(thing.right)
+    return thing.forward + side, side, thing.right
+
+
+def _wall(ray: Sequence[str]) -> int:
     """Steps to the first thing on a ray if that is a wall, else 0."""
-    for steps in range(1, size):
-        kind = kinds.get((forward * steps, right * steps), "unseen")
+    for steps, kind in enumerate(ray, 1):
         if kind not in ("empty", "floor"):
             return steps if kind == "wall" else 0
     return 0

@@ -19,17 +19,14 @@ from typing import Any, ClassVar, Literal
 
 from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
 from agentspec.envs.thor import homes, mining
-from agentspec.envs.thor.engine import OfflineThor, Settings
+from agentspec.envs.thor.engine import Settings
 from agentspec.envs.thor.game import Game, Told, check
-from agentspec.envs.thor.geodesic import distances
 from agentspec.envs.thor.names import Names, direction, whereabouts, words
-from agentspec.envs.thor.scene import Scene, cell_at
-from agentspec.envs.thor.sight import Camera
+from agentspec.envs.thor.protocol import Event
+from agentspec.envs.thor.scene import Scene
+from agentspec.envs.thor.sight import ROBOT_HEIGHT, Camera
 from agentspec.metrics import Metric
 from agentspec.types import Action, ActionSchema, ActionSpec
-
-HEIGHT = 0.87
-"""Camera height of the robot, metres; not verified against the simulator."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +38,7 @@ class Preset:
 
 
 def _preset(turn: float, fov: float, reach: float, steps: int, grid: float = 0.25, size: Any = (300, 300)) -> Preset:
-    camera = Camera(HEIGHT, fov, size[0] / size[1])
+    camera = Camera(ROBOT_HEIGHT, fov, size[0] / size[1])
     settings = Settings(
         grid=grid,
         rotate_step=turn,
@@ -88,14 +85,17 @@ class RoboThorEnv(Game):
         objects: folder with recorded object metadata; default: `objects` two folders above `data`.
         action_mode: `native` calls, or a `menu` of six phrases.
         reward: `success` (1 for it) or `progress` (besides, metres come nearer to the target over the shortest path's
-            length, clipped by the metres moved).
+            length, clipped to -1..1).
         max_steps: instead of the preset's.
         images: put the egocentric picture into the observation.
         render_mode: None or "rgb_array".
+        player: `offline`, or `ai2thor`: the simulator, version 5.0.0.
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
 
     Raises:
         ValueError: an argument that is none of these.
         NoData: public data that are not where the paths say.
+        NoSimulator: at reset, with the player `ai2thor`: it cannot be started.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -128,6 +128,8 @@ class RoboThorEnv(Game):
         max_steps: int = 0,
         images: bool = False,
         render_mode: str | None = None,
+        player: Literal["offline", "ai2thor"] = "offline",
+        executable: str = "",
     ) -> None:
         check("preset", preset, tuple(PRESETS))
         check("suite", suite, ("own", "validation"))
@@ -138,15 +140,18 @@ class RoboThorEnv(Game):
         if max_steps < 0:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1, or 0 for the preset's")
         self.preset = PRESETS[preset]
-        self.settings = self.preset.settings
+        self._objects = objects or str(Path(data).parent.parent / "objects")
         super().__init__(
             max_steps=max_steps or self.preset.max_steps,
             images=images,
-            pixels=(self.settings.width, self.settings.height),
+            settings=self.preset.settings,
             render_mode=render_mode,
+            player=player,
+            version="5.0.0",
+            executable=executable,
+            folders={"episodes": data, "objects": self._objects} if data else {},
         )
         self._suite, self._id, self._data, self._reward = suite, episode, data, reward
-        self._objects = objects or str(Path(data).parent.parent / "objects")
         self._actions = _schema(menu=action_mode == "menu")
 
     # -- the episode -------------------------------------------------------------------------------------------
@@ -173,47 +178,59 @@ class RoboThorEnv(Game):
 
     def _begin(self, seed: int) -> None:
         self.episode = self.episode_of(seed)
-        self.world = OfflineThor(self._scene(self.episode), self.settings)
         e = self.episode
-        self.world.step({"action": "TeleportFull", "x": e.x, "z": e.z, "rotation": e.yaw, "horizon": e.horizon})
-        self.walked, self.won, self.earned = 0.0, False, 0.0
+        self.world = self._open(e.scene, lambda: self._scene(e))
+        start = {"action": "TeleportFull", "x": e.x, "z": e.z, "rotation": e.yaw, "horizon": e.horizon}
+        self.event = self.world.step(start)
+        if not self.event.success:
+            raise ValueError(f"episode {e.id} does not fit scene {e.scene}: {self.event.error}")
+        self.walked, self.won = 0.0, False
+        self.far = self.near = self.left_to_go = self.world.distance(e.target)
         self.names = Names()
-        self.names.add(self.world.observe().metadata["objects"])
-        self.left_to_go = distances(self.world.viewpoints(e.target), self.world.scene.cells)[0]
+        self.names.add(self.event.metadata["objects"])
 
     def _schema(self) -> ActionSchema:
         return self._actions
 
     def _carry_out(self, action: Action) -> None:
         call = next(name for name, (_, phrase, _) in CALLS.items() if action.name in (name, phrase))
-        agent = self.world.state.agent
-        x, z, before = agent.x, agent.z, self._distance()
+        at = self.event.metadata["agent"]["position"]
         event = self.act({"action": CALLS[call][0]})
-        moved = math.hypot(agent.x - x, agent.z - z)
-        self.walked += moved
+        now = event.metadata["agent"]["position"]
+        self.walked += math.hypot(now["x"] - at["x"], now["z"] - at["z"])
         if call == "STOP":
             self.stopped, self.won = True, self._in_view()
-        after = self._distance()
-        if before is not None and after is not None:
-            self.earned += max(-moved, min(moved, before - after)) / max(self.episode.length, 1.0)
         # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
         self.told = Told(CALLS[call][2] if event.success else f"could not {CALLS[call][1]}, {event.error}")
 
+    def act(self, action: Mapping[str, Any]) -> Event:
+        """One primitive: it counts, and may bring the target nearer."""
+        self.event = super().act(action)
+        if str(action["action"]).startswith("Move"):
+            self.left_to_go = self.world.distance(self.episode.target)
+            self.near = self.near if self.left_to_go is None else self.left_to_go
+        return self.event
+
     def _in_view(self) -> bool:
-        objects = self.world.observe().metadata["objects"]
+        objects = self.event.metadata["objects"]
         return any(o["visible"] and o["objectType"] == self.episode.target for o in objects)
 
-    def _distance(self) -> float | None:
-        agent = self.world.state.agent
-        return self.left_to_go.get(cell_at(agent.x, agent.z))
-
     def _value(self) -> float:
-        return float(self.won) + (self.earned if self._reward == "progress" else 0.0)
+        return float(self.won) + (self._nearer() if self._reward == "progress" else 0.0)
+
+    def _nearer(self) -> float:
+        """Metres come nearer since the start over the shortest path's length (at least 1 m), within -1..1.
+
+        It depends on where the agent is, not on how it got there, so that no loop earns anything.
+        """
+        if self.far is None or self.near is None:
+            return 0.0
+        return max(-1.0, min(1.0, (self.far - self.near) / max(self.episode.length, 1.0)))
 
     # -- reporting ---------------------------------------------------------------------------------------------
 
     def _describe(self) -> dict[str, Any]:
-        metadata = self.world.observe().metadata
+        metadata = self.event.metadata
         agent, target = metadata["agent"], self.episode.target
         seen = []
         for one in metadata["objects"]:
@@ -269,17 +286,18 @@ class RoboThorEnv(Game):
             "success": float(self.won),
             "spl": spl,
             "path_length": p,
-            "distance_left": self._distance(),
+            "distance_left": self.left_to_go,
             "shortest_path": length,
         }
 
     # -- exact state -------------------------------------------------------------------------------------------
 
     def _records(self) -> dict[str, Any]:
-        return {"walked": self.walked, "won": self.won, "earned": self.earned}
+        return {"walked": self.walked, "won": self.won, "near": self.near}
 
     def _recall(self, records: Mapping[str, Any]) -> None:
-        self.walked, self.won, self.earned = records["walked"], records["won"], records["earned"]
+        self.walked, self.won, self.near = records["walked"], records["won"], records["near"]
+        self.event, self.left_to_go = self.world.observe(), self.world.distance(self.episode.target)
 
 
 def _schema(*, menu: bool) -> ActionSchema:

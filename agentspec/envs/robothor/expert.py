@@ -29,7 +29,8 @@ class Oracle:
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         taken = inspect.signature(RoboThorEnv.__init__).parameters
-        given = {k: v for k, v in options.items() if k in taken} | {"images": False, "render_mode": None}
+        own = {"images": False, "render_mode": None, "player": "offline", "executable": ""}
+        given = {k: v for k, v in options.items() if k in taken} | own
         self._env = RoboThorEnv(**given)
         self._plan: list[str] = []
         self._due: tuple[Any, ...] = ()
@@ -48,7 +49,8 @@ class Oracle:
         env = self._env
         if env.episode_seed != state["seed"]:
             env.reset(seed=state["seed"])
-        world, agent = env.world, env.world.state.agent
+        world = env.world.boxes()
+        agent = world.state.agent
         targets = [b for b in world.state.bodies.values() if b.type == env.episode.target]
         start = (state["x"], state["z"], state["yaw"])
         before: dict[Pose, tuple[Pose, str]] = {}

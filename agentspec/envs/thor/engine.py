@@ -82,7 +82,6 @@ class OfflineThor:
         self.scene = scene
         self.state = place(scene)
         self.sight = Sight(scene, self.settings.camera, self.settings.visibility, self.settings.slack)
-        self._ways: dict[frozenset[Cell], Any] = {}
         self._last = ("Initialize", True, "", None)
         self.touched()
         return self.observe()
@@ -104,6 +103,13 @@ class OfflineThor:
         except (KeyError, TypeError, ValueError) as error:
             self._last = (name, False, f"{name} has missing or malformed fields ({error!r})", None)
         return self.observe()
+
+    def boxes(self) -> OfflineThor:
+        """This world itself."""
+        return self
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def try_move(self, name: str) -> None:
         """A move or turn without an event, for searches; one that is blocked changes nothing."""
@@ -162,18 +168,26 @@ class OfflineThor:
     def _shortest_path(self, action: Mapping[str, Any]) -> dict[str, Any]:
         """Corners of the shortest way to a place from which an object is seen; `objectId` or `objectType`."""
         wanted = str(action.get("objectId") or action.get("objectType") or "")
-        goals = self.viewpoints(wanted)
-        if not goals:
-            raise Refused(f"no place is known from which {wanted!r} is seen")
         start = action.get("position")
         agent = self.state.agent
         cell = cell_at(float(start["x"]), float(start["z"])) if start else cell_at(agent.x, agent.z)
-        if goals not in self._ways:
-            self._ways[goals] = distances(goals, self.scene.cells)
-        best, towards = self._ways[goals]
+        best, towards = self._way(wanted)
         if cell not in best:
             raise Refused(f"there is no way to a place from which {wanted!r} is seen")
         return {"corners": [self._point(c) for c in corners(cell, towards)], "length": best[cell]}
+
+    def distance(self, target: str) -> float | None:
+        """Metres on foot to where an object (id or type) is seen; None if there is no way."""
+        agent = self.state.agent
+        return self._way(target)[0].get(cell_at(agent.x, agent.z))
+
+    def _way(self, wanted: str) -> tuple[dict[Cell, float], dict[Cell, Cell]]:
+        """`geodesic.distances` to where an object is seen; searched once until an object changes."""
+        if wanted in self.scene.sights:
+            return self.scene.ways(wanted)
+        if wanted not in self._ways:
+            self._ways[wanted] = distances(self.viewpoints(wanted), self.scene.cells)
+        return self._ways[wanted]
 
     def viewpoints(self, wanted: str) -> frozenset[Cell]:
         """The cells from which an object (id or type) is seen in some direction, whatever the agent does now.
@@ -204,6 +218,7 @@ class OfflineThor:
         self._places = np.array([b.position for b in self.state.bodies.values()]).reshape(-1, 3)
         self._index = {name: i for i, name in enumerate(self.state.bodies)}
         self._seen: dict[tuple[float, ...], Any] = {}
+        self._ways: dict[str, tuple[dict[Cell, float], dict[Cell, Cell]]] = {}
 
     def sees(self, body: Body) -> bool:
         """Whether an object is visible to the agent now."""
@@ -261,3 +276,6 @@ ASKING: Mapping[str, Callable[[OfflineThor, Mapping[str, Any]], Any]] = {
     **dict.fromkeys(NOTHING, lambda world, action: None),
 }
 """Action -> what answers it; the answer is the event's `actionReturn`."""
+
+KNOWN = frozenset({*MOVES, *TURNS, *LOOKS, *CHANGING, *ASKING})
+"""The actions there are."""

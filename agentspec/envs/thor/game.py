@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,8 +20,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
-from agentspec.envs.thor.engine import OfflineThor
-from agentspec.envs.thor.protocol import Event
+from agentspec.envs.thor.engine import OfflineThor, Settings
+from agentspec.envs.thor.protocol import Event, Thor
+from agentspec.envs.thor.scene import Scene
 from agentspec.types import Action, ActionError, ActionSchema
 
 MAX_ACTION = 256
@@ -46,23 +47,45 @@ class Game(gymnasium.Env[dict[str, Any], str]):
     Args:
         max_steps: primitive actions after which the episode is truncated; success on the last one is a success.
         images: put the egocentric picture into the observation as "image".
-        pixels: (width, height) of pictures.
+        settings: of the player.
         render_mode: None or "rgb_array".
+        player: `offline`, or `ai2thor`, the simulator.
+        version: of ai2thor that the simulator needs.
+        executable: see `simulator.player.Ai2Thor`.
+        folders: see there.
     """
 
-    world: OfflineThor
+    world: Thor
 
-    def __init__(self, *, max_steps: int, images: bool, pixels: tuple[int, int], render_mode: str | None) -> None:
+    def __init__(
+        self,
+        *,
+        max_steps: int,
+        images: bool,
+        settings: Settings,
+        render_mode: str | None,
+        player: str = "offline",
+        version: str = "",
+        executable: str = "",
+        folders: Mapping[str, str] | None = None,
+    ) -> None:
         check("render_mode", render_mode, (None, "rgb_array"))
+        check("player", player, ("offline", "ai2thor"))
+        if executable and player == "offline":
+            raise ValueError(f"executable is {executable!r} but the player is offline; expected player='ai2thor'")
         if max_steps < 1:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
         self.max_steps, self.images, self.render_mode = max_steps, images, render_mode
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
         shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=20_000, charset=_CHARSET)}
         if images:
-            shown["image"] = spaces.Box(0, 255, (pixels[1], pixels[0], 3), np.uint8)
+            shown["image"] = spaces.Box(0, 255, (settings.height, settings.width, 3), np.uint8)
         self.observation_space = spaces.Dict(shown)
         self.episode_seed: int | None = None
+        self.settings = settings
+        self._simulator: Any = None
+        self._simulated = {"version": version, "executable": executable, "folders": folders or {}}
+        self._player = player
 
     # -- what a game is ----------------------------------------------------------------------------------------
 
@@ -96,6 +119,19 @@ class Game(gymnasium.Env[dict[str, Any], str]):
 
     def _recall(self, records: Mapping[str, Any]) -> None:
         """Go back to `_records`."""
+
+    def _open(self, name: str, scene: Callable[[], Scene]) -> Thor:
+        """The player, at the beginning of a scene (which the simulator has by name)."""
+        if self._player == "offline":
+            return OfflineThor(scene(), self.settings)
+        if self._simulator is None:
+            from agentspec.envs.thor.simulator.player import Ai2Thor
+
+            pictures = self.images or self.render_mode is not None
+            self._simulator = Ai2Thor(settings=self.settings, pictures=pictures, **self._simulated)
+        self._simulator.begin(name)
+        player: Thor = self._simulator
+        return player
 
     # -- the Gymnasium interface -------------------------------------------------------------------------------
 
@@ -174,6 +210,12 @@ class Game(gymnasium.Env[dict[str, Any], str]):
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The egocentric picture, uint8 (H, W, 3), with `render_mode="rgb_array"`, else None."""
         return self.world.observe().frame if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """End the simulator, where one plays."""
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
 
     # -- exact state -------------------------------------------------------------------------------------------
 

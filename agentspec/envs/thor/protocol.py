@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from agentspec.envs.thor.engine import OfflineThor
 
 Picture = npt.NDArray[np.uint8]
 
@@ -59,4 +62,28 @@ class Thor(Protocol):
 
     def step(self, action: Mapping[str, Any]) -> Event:
         """Carry out one action; never raises for what an action asks."""
+        ...
+
+    def observe(self) -> Event:
+        """The event of the last step, without acting."""
+        ...
+
+    def boxes(self) -> OfflineThor:
+        """The present state as a world of boxes, to plan ways in; acting in it is nobody's business."""
+        ...
+
+    def distance(self, target: str) -> float | None:
+        """Metres on foot to where an object of this type or id is seen; None if no way is known."""
+        ...
+
+    def snapshot(self) -> bytes:
+        """The exact state."""
+        ...
+
+    def restore(self, blob: bytes) -> Event:
+        """Go back to a `snapshot` of the same scene."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what the player holds."""
         ...

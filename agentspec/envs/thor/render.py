@@ -70,7 +70,7 @@ def draw(scene: Scene, state: State, settings: Settings) -> Picture:
     focal = settings.height / 2 / settings.camera.half
     _floor(canvas, scene, eye, turn, focal, size)
     walls = [(np.array(c), np.array(s), WALLS) for c, s in scene.walls]
-    shut = {b.id for b in state.bodies.values() if b.closed}
+    shut = {b.id for b in state.bodies.values() if b.closed or b.held}
     boxes = [
         (np.array(b.centre), np.array(b.size), _colour(b.type, b.on))
         for b in state.bodies.values()

@@ -24,6 +24,7 @@ from agentspec.llm.local.adapters import UNTAGGED, adapter_for, check_adapters
 from agentspec.llm.local.engine import Engine
 from agentspec.llm.local.forward import PackedModel
 from agentspec.llm.local.rows import Job
+from agentspec.llm.local.states import StateRecorder
 from agentspec.llm.models import quiet, resolve
 from agentspec.types import LLMCall, Sampling, Usage
 
@@ -190,6 +191,11 @@ class LocalLLM:
         Writes in place, as optimisers make them, and another active adapter are noticed without it.
         """
         self._engine.invalidate()
+
+    def record_states(self, layer: Any) -> StateRecorder:
+        """From now on, what goes into a decoder `layer` of the model is recorded."""
+        self._engine.model.recorder = recorder = StateRecorder(layer)
+        return recorder
 
     async def _submit(self, number: int, job: Job) -> None:
         await self._batcher.submit(job.episode, number, job)

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from agentspec.llm.local.states import Pieces, up_to
+
 _GROWTH = 1.25
 _BONUS = 16
 
@@ -33,7 +35,7 @@ class Slot:
     multiple of ``block``.
     """
 
-    __slots__ = ("adapter", "block", "capacity", "epoch", "keys", "length", "owner", "tokens", "used", "values")
+    __slots__ = ("adapter", "block", "capacity", "epoch", "keys", "length", "owner", "seen", "tokens", "used", "values")
 
     def __init__(self, layers: int, capacity: int, block: int = 64) -> None:
         self.keys: list[torch.Tensor | None] = [None] * layers
@@ -42,6 +44,7 @@ class Slot:
         self.capacity = _round_up(capacity, block)
         self.length = 0
         self.tokens = np.empty(0, np.int32)
+        self.seen: Pieces = []
         self.owner: str | None = None
         self.adapter = ""
         self.epoch = 0
@@ -82,6 +85,7 @@ class Slot:
         self.reserve(length)
         for layer in range(len(source.keys)):
             self.copy_layer(layer, source, 0, length)
+        self.seen = up_to(source.seen, length)
         self.length = length
 
     def _buffers(self, layer: int, key: torch.Tensor, value: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -142,6 +142,8 @@ class Engine:
 
     def _finish(self, row: Row, running: Sequence[Row]) -> None:
         """Keep the first sample's keys and values; the others' differ in a few tokens only."""
+        if self.model.recorder is not None and not isinstance(row, ScoreRow):
+            self.model.recorder.keep(row.job.episode, row.tokens[: row.slot.length], row.slot.seen)
         if row.index:
             return
         for other in running:

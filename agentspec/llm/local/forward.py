@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -29,6 +29,7 @@ from agentspec.llm.local.attention import Pack, Segment, active, packed_attentio
 from agentspec.llm.local.cache import Slot
 from agentspec.llm.local.invariance import MIN_ROWS, InvariantModules
 from agentspec.llm.local.probe import is_batch_invariant
+from agentspec.llm.local.states import StateRecorder
 
 _ATTENTION = "agentspec_packed"
 _LAYER_TYPES = frozenset({"full_attention", "sliding_attention", "attention"})
@@ -59,6 +60,7 @@ class PackedModel:
         self.layers = int(text.num_hidden_layers)
         self.max_context = int(getattr(text, "max_position_embeddings", None) or 1 << 30)
         self._keeps = "logits_to_keep" in parameters
+        self.recorder: StateRecorder | None = None
         self._modules = InvariantModules(model)
         self._checked = False
         self._invariant: tuple[int, bool] | None = None
@@ -101,6 +103,8 @@ class PackedModel:
             )
         for s in segments:
             s.slot.length = s.start + len(s.tokens)
+        if self.recorder is not None:
+            self.recorder.note(segments, bounds)
         logits = out.logits[0] if self._keeps else out.logits[0][keep]
         return list(logits[: len(wanted)].float().split([s.logits for s in segments]))
 
@@ -113,7 +117,7 @@ class PackedModel:
             config: Any = getattr(module, "config", None)
             if hasattr(config, "_attn_implementation_internal"):
                 configs[id(config)] = (config, config._attn_implementation_internal)
-        with _evaluating(self.model):
+        with _evaluating(self.model), self.recorder.watching() if self.recorder else nullcontext():
             try:
                 for config, _ in configs.values():
                     config._attn_implementation_internal = _ATTENTION

@@ -66,7 +66,7 @@ class InvariantModules:
         """
         replaced: list[nn.Module] = []
         try:
-            if _packs() and next(self._model.parameters()).device.type == "cpu":
+            if packs() and next(self._model.parameters()).device.type == "cpu":
                 for module, forward in self._replacements():
                     module.forward = forward
                     replaced.append(module)
@@ -84,7 +84,7 @@ class InvariantModules:
         for module in self._model.modules():
             if id(module) in inside or not _is_plain(module):
                 continue
-            linear, adapters = _mergeable(module)
+            linear, adapters = mergeable(module)
             if linear is not None:
                 inside.update(map(id, module.modules()))
                 yield module, _product(self._weight(module, linear, adapters), linear.bias)
@@ -114,7 +114,8 @@ def version(tensor: torch.Tensor) -> int:
     return 0 if tensor.is_inference() else tensor._version
 
 
-def _packs() -> bool:
+def packs() -> bool:
+    """Whether linear layers can multiply through oneDNN with prepacked weights."""
     # Operators that torch's own compiler uses; a build without oneDNN lacks them.
     known = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
     return known and hasattr(torch.ops.mkldnn, "_reorder_linear_weight") and not torch.is_autocast_enabled("cpu")
@@ -125,8 +126,8 @@ def _is_plain(module: nn.Module) -> bool:
     return "forward" not in vars(module)
 
 
-def _mergeable(module: Any) -> tuple[nn.Linear | None, tuple[str, ...]]:
-    """The linear layer that `module` is, or is a plain LoRA around, and the adapters to add to it; else `None`."""
+def mergeable(module: Any) -> tuple[nn.Linear | None, tuple[str, ...]]:
+    """In float32 on a CPU, the linear layer that `module` is, or is a plain LoRA around, and the adapters to add."""
     if type(module) is nn.Linear:
         return (module if _is_float32(module.weight) else None), ()
     if not _is_lora_linear(module):

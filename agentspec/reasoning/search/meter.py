@@ -4,15 +4,18 @@ A method with many calls per decision asks the model through a `Meter`. Question
 other are asked together (`Meter.ask_all`), so that a batching backend runs them as one batch. Three things may
 end a search early: the method's own limits, the episode's budget, and a prompt that outgrew the model's context. All
 three raise `OutOfBudgetError`; the method catches it and answers with the best action it has, flagged by
-`trace["exhausted"]`. If it has none because nothing could be read, one plain question for the action follows, with what
-was wrong, at most `max_retries` times (`last_resort`); only then there is nothing to answer with (`Meter.undecided`).
+`trace["exhausted"]`.
+
+An answer that holds no action is asked for again, with what was wrong, as long as the decision's `retries` last
+(`ask_again`). If there is no action at all then, one plain question for it follows, with what is left of them
+(`last_resort`); only then there is nothing to answer with (`Meter.undecided`).
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.llm.base import ContextOverflowError, LLMError, Message
@@ -36,6 +39,15 @@ class Ask:
     credit: Credit = "aux"
 
 
+@dataclass(frozen=True)
+class Unread:
+    """An answer that holds no action: the question (as it is asked again), and which completion of which call."""
+
+    ask: Ask
+    call: LLMCall
+    completion: int = 0
+
+
 class Meter:
     """A module's model under the budget of one decision.
 
@@ -43,14 +55,19 @@ class Meter:
         llm: the module's metered model.
         calls: most requests and scorings (`None`: no limit).
         tokens: once this many tokens went in and out, no further request is made (`None`: no limit).
+        retries: further calls that may be made for answers without an action.
 
     Attributes:
         exhausted: what ran out: `"calls"`, `"tokens"`, `"episode"` (its budget), `"context"`, or empty.
         answered: the first answer that proposed an action, for messages about what could not be read.
     """
 
-    def __init__(self, llm: ModuleLLM, calls: int | None = None, tokens: int | None = None) -> None:
+    def __init__(
+        self, llm: ModuleLLM, calls: int | None = None, tokens: int | None = None, *, retries: int = 0
+    ) -> None:
         self._llm = llm
+        self.retries = retries
+        self.asked_again = 0
         self._limits = {"calls": calls, "tokens": tokens}
         self.calls = 0
         self.scorings = 0
@@ -135,6 +152,17 @@ class Meter:
             self.exhausted = "calls"
         return max(0, min(wanted, room))
 
+    def retry(self, wanted: int) -> int:
+        """How many of `wanted` answers may be asked for again now; they are taken off `retries`."""
+        granted = 0 if self.exhausted else min(wanted, self.retries)
+        self.retries -= granted
+        self.asked_again += granted
+        return granted
+
+    def count(self, error: ActionError) -> None:
+        """Count an answer that holds no action."""
+        self._llm.count("truncated" if error.code == "TRUNCATED" else "malformed")
+
     def stop(self) -> None:
         """Raise `OutOfBudgetError` if something ran out."""
         if self.exhausted:
@@ -148,6 +176,8 @@ class Meter:
         spent: dict[str, Any] = {"calls": self.calls, "tokens": self.tokens}
         if self.scorings:
             spent["scorings"] = self.scorings
+        if self.asked_again:
+            spent["asked_again"] = self.asked_again
         if self.exhausted:
             spent["exhausted"] = self.exhausted
         return spent
@@ -171,24 +201,61 @@ class Meter:
         )
 
 
+async def ask_again(
+    meter: Meter, unread: Sequence[Unread], schema: ActionSchema, found: Callable[[LLMCall], bool]
+) -> list[tuple[LLMCall, tuple[tuple[int, int], ...]] | None]:
+    """Answers without an action, asked for again together with what was wrong, while the meter's retries last.
+
+    Args:
+        meter: of the decision.
+        unread: the answers.
+        schema: the actions.
+        found: whether an answer holds what was asked for.
+
+    Returns:
+        For each of them the answer that does, and all (call id, completion) that it took; `None` if there is none.
+    """
+    prompts = [u.ask.messages for u in unread]
+    answered = [(u.call, u.completion) for u in unread]
+    chains: list[tuple[tuple[int, int], ...]] = [((u.call.id, u.completion),) for u in unread]
+    results: list[tuple[LLMCall, tuple[tuple[int, int], ...]] | None] = [None] * len(unread)
+    waiting = list(range(len(unread)))
+    while granted := meter.retry(len(waiting)):
+        now, waiting = waiting[:granted], waiting[granted:]
+        for i in now:
+            call, completion = answered[i]
+            error = read_call(call, schema, completion).action
+            if isinstance(error, ActionError):
+                meter.count(error)
+            reply = complaint(error, schema) if isinstance(error, ActionError) else default_answer(schema)
+            prompts[i] = in_private(prompts[i], sampled(call, completion), reply)
+        asks = [replace(unread[i].ask, messages=prompts[i]) for i in now]
+        for i, call in zip(now, await meter.ask_all(asks), strict=False):  # fewer when the budget ended among them
+            answered[i], chains[i] = (call, 0), (*chains[i], (call.id, 0))
+            if found(call):
+                results[i] = (call, chains[i])
+            else:
+                waiting.append(i)
+    return results
+
+
 async def last_resort(
-    meter: Meter, messages: Sequence[Message], schema: ActionSchema, trace: Mapping[str, Any], max_retries: int
+    meter: Meter, messages: Sequence[Message], schema: ActionSchema, trace: Mapping[str, Any]
 ) -> Decision:
     """The decision of a method none of whose answers held a legal action: it is asked for plainly, told what was wrong.
 
     Args:
-        meter: of the decision; its limits hold.
+        meter: of the decision; its limits hold, and what is left of its retries.
         messages: the step's prompt, ending in the observation.
         schema: the actions.
         trace: the method's trace.
-        max_retries: calls that may be made.
     """
     error = read(meter.answered, schema).action
     reply = complaint(error, schema) if isinstance(error, ActionError) else default_answer(schema)
     prompt: Sequence[Message] = with_request(messages, reply)
     sampling = {"choices": schema.choices} if schema.choices else {}
     calls: list[tuple[int, int]] = []
-    while len(calls) < max_retries and not meter.exhausted:
+    while meter.retry(1):
         asked = await meter.ask_all([Ask("act", prompt, sampling, "executed")])
         if not asked:
             break
@@ -196,9 +263,12 @@ async def last_resort(
         calls.append((call.id, 0))
         reading = read_call(call, schema)
         if isinstance(reading.action, Action):
-            found = {**trace, **meter.trace(), "asked_again": len(calls)}
             return Decision(
-                reading.action, rationale=call.text, calls=tuple(calls), turn=(reading.action.text,), trace=found
+                reading.action,
+                rationale=call.text,
+                calls=tuple(calls),
+                turn=(reading.action.text,),
+                trace={**trace, **meter.trace()},
             )
         prompt = in_private(prompt, sampled(call), complaint(reading.action, schema))
     return meter.undecided(trace)

@@ -1,17 +1,21 @@
-"""Where a search gets its next actions from: samples of the policy, the same ones merged."""
+"""Where a search gets its next actions from: samples of the policy, the same ones merged.
+
+Of several samples those without an action are proposals fewer: a search samples many to have some. If none of them
+holds one, they are asked for again with what was wrong, within the decision's retries.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from agentspec.actions import canonical, parse_action
-from agentspec.llm.base import Message
-from agentspec.prompting import with_request
+from agentspec.llm.base import Message, assistant, user
+from agentspec.prompting import MENU_ANSWER, sampled, with_request
 from agentspec.reading import labelled, read
-from agentspec.reasoning.search.meter import Meter
+from agentspec.reasoning.search.meter import Ask, Meter, Unread, ask_again
 from agentspec.types import Action, ActionSchema, LLMCall
 from agentspec.values import takes_lines
 from agentspec.visible import visible
@@ -27,12 +31,16 @@ _BULLET = re.compile(r"^\s*(?:[-*•]|\(?\d+[.):])\s*")
 
 @dataclass(frozen=True)
 class Proposal:
-    """A candidate: its text, how many samples proposed it, the first of them, and the thought before it."""
+    """A candidate: its text, how many samples proposed it, the first of them, and the thought before it.
+
+    `before` is the completion of the thought where it was a call of its own.
+    """
 
     text: str
     count: int
     source: tuple[int, int]
     thought: str = ""
+    before: tuple[tuple[int, int], ...] = ()
 
 
 def read_step(
@@ -88,13 +96,71 @@ async def sample_steps(
     Decoding is constrained to the menu where there is one and the state is not an `imagined` one. Every sample is
     credited `explored`; whoever executes one credits it anew.
     """
-    if schema.choices and not imagined:
-        call = await meter.ask(
-            "propose", with_request(messages, request), "explored", n=n, choices=schema.choices, **sampling
-        )
+    choices = {"choices": schema.choices} if schema.choices and not imagined else {}
+    ask = Ask("propose", with_request(messages, request), {"n": n, **choices, **sampling}, "explored")
+    calls = await meter.ask_all([ask])
+    meter.stop()
+
+    def proposals(call: LLMCall) -> list[Proposal]:
+        return merge(call, schema, imagined=imagined)
+
+    return proposals(await readable(meter, ask, calls[0], schema, proposals))
+
+
+async def readable(
+    meter: Meter, ask: Ask, call: LLMCall, schema: ActionSchema, proposals: Callable[[LLMCall], Sequence[Any]]
+) -> LLMCall:
+    """`call`, or if it holds no `proposals`, the answer to the question asked again (`call` if there is none)."""
+    if proposals(call):
+        return call
+    (again,) = await ask_again(meter, [Unread(ask, call)], schema, lambda answer: bool(proposals(answer)))
+    return call if again is None else again[0]
+
+
+async def think_and_choose(
+    meter: Meter,
+    messages: Sequence[Message],
+    schema: ActionSchema,
+    request: str,
+    *,
+    n: int,
+    temperature: float,
+    **limit: Any,
+) -> list[Proposal]:
+    """`n` thoughts as samples of one request, and after each of them one entry of the menu; equal entries merged.
+
+    Args:
+        meter: of the decision.
+        messages: the step's prompt.
+        schema: with the menu's choices.
+        request: asks for the thought.
+        n: samples.
+        temperature: of thoughts and choices.
+        limit: sampling overrides of the thoughts.
+    """
+    asked = with_request(messages, request)
+    thoughts = await meter.ask("think", asked, "explored", n=n, temperature=temperature, **limit)
+    choices = {"choices": schema.choices, "temperature": temperature}
+    asks = [
+        Ask("propose", (*asked, assistant(sampled(thoughts, i)), user(MENU_ANSWER)), choices, "explored")
+        for i in range(len(thoughts.completions))
+    ]
+
+    def chosen(call: LLMCall) -> list[Proposal]:
         return merge(call, schema, imagined=False)
-    call = await meter.ask("propose", with_request(messages, request), "explored", n=n, **sampling)
-    return merge(call, schema, imagined=imagined)
+
+    found: dict[Hashable, Proposal] = {}
+    for i, (ask, call) in enumerate(zip(asks, await meter.ask_all(asks), strict=False)):
+        for proposal in chosen(await readable(meter, ask, call, schema, chosen)):
+            said = " ".join(visible(thoughts.completions[i].text)[0].split())
+            known = found.get(proposal.text)
+            found[proposal.text] = (
+                replace(proposal, thought=said, before=((thoughts.id, i),))
+                if known is None
+                else replace(known, count=known.count + 1)
+            )
+    meter.stop()
+    return list(found.values())
 
 
 def merge(call: LLMCall, schema: ActionSchema, *, imagined: bool) -> list[Proposal]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import random
+
+import pytest
+from minigrid.core.constants import IDX_TO_COLOR, IDX_TO_OBJECT
 from minigrid.core.grid import Grid
 from minigrid.core.world_object import Ball, Door, Goal, Key, Lava, Wall
 
 from agentspec.envs.minigrid.env import MiniGridEnv
-from agentspec.envs.minigrid.view import basic, compact, look, relational
+from agentspec.envs.minigrid.suites import SUITES
+from agentspec.envs.minigrid.view import Thing, basic, compact, look, relational
 
 
 def world(*, carrying=None, **cells):
@@ -98,3 +103,49 @@ def test_feedback_says_what_an_action_did():
         "dropped red key",
         "toggled nothing",
     ]
+
+
+LEVELS = (
+    *(layout for ids in SUITES.values() for layout in ids),
+    "MiniGrid-Dynamic-Obstacles-6x6-v0",
+    "MiniGrid-KeyCorridorS3R3-v0",
+    "MiniGrid-LockedRoom-v0",
+    "MiniGrid-ObstructedMaze-Full-v1",
+    "MiniGrid-Playground-v0",
+    "MiniGrid-UnlockPickup-v0",
+    "BabyAI-GoToSeqS5R2-v0",
+    "BabyAI-UnlockPickupDist-v0",
+)
+
+
+@pytest.mark.parametrize("level", sorted(set(LEVELS)))
+def test_what_is_seen_is_what_minigrid_itself_shows(level):
+    """Every cell of the symbolic view, decoded by MiniGrid's own tables, under random play."""
+    env, rng = MiniGridEnv(level=level, max_steps=60), random.Random(level)
+    env.reset(seed=3)
+    types, colours = IDX_TO_OBJECT, IDX_TO_COLOR
+    for _ in range(40):
+        seen = env.world.gen_obs()["image"]
+        view = look(env.world)
+        expected = []
+        for row in range(7):
+            for column in range(7):
+                kind, colour, state = (int(v) for v in seen[column, row])
+                forward, right = 6 - row, column - 3
+                if (forward, right) == (0, 0):
+                    continue
+                cell = view.cells[forward][column] if forward < len(view.cells) else "unseen"
+                assert cell == types[kind]
+                if types[kind] not in ("unseen", "empty", "wall", "floor"):
+                    word = ("open", "closed", "locked")[state] if types[kind] == "door" else ""
+                    expected.append(Thing(types[kind], colours[colour], word, forward, right))
+        assert sorted(view.things, key=repr) == sorted(expected, key=repr)
+        if env.step(rng.choice(["FORWARD()", "FORWARD()", "TURN_LEFT()", "PICK_UP()", "TOGGLE()", "DROP()"]))[2]:
+            break
+
+
+def test_nothing_of_minigrid_stays_changed_after_a_step():
+    env = MiniGridEnv()
+    env.reset(seed=0)
+    env.step("FORWARD()")
+    assert "gen_obs" not in vars(env.world) and env.world.gen_obs()["image"].shape == (7, 7, 3)

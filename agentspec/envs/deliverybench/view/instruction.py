@@ -14,6 +14,8 @@ from agentspec.envs.deliverybench.view.wording import HERE, at, duration
 from agentspec.envs.deliverybench.world.food import MENU
 from agentspec.envs.deliverybench.world.rules import Rules
 
+_PLANNED = '{"action": "WAIT(60)", "plan": "then fetch 3 and 5"}'
+
 
 def instruction(city: City, rules: Rules, shift_hours: float, compact: bool, menu: bool) -> str:
     """The instruction: for the menu and compact texts a short one, in full texts with prices and all places."""
@@ -41,11 +43,15 @@ def _listed(lines: list[str]) -> str:
 
 def _reach(rules: Rules, compact: bool) -> list[str]:
     reach = f"{rules.nearby / 100:.0f}m"
-    return [
-        f'You act on what is within {reach} of you; it is marked "{HERE}". Distances are ways along the streets.',
+    lines = [
+        f'You act on what is within {reach} of you; it is marked "{HERE}". Distances are ways along the streets'
+        + ("." if compact else ", those beside a place from where you are."),
         "A dish stands with the temperature to serve it at; "
         + ("once fetched as now/serve: Burger 58/60C." if compact else "in hands and bag with the one it has now."),
     ]
+    if not compact:
+        lines.append("An offer stands with its pay, the way from restaurant to customer, and the time allowed.")
+    return lines
 
 
 def _trade(rules: Rules, menu: bool) -> list[str]:
@@ -110,7 +116,8 @@ def _habits(rules: Rules, compact: bool) -> list[str]:
         board,
         "Otherwise only moving, waiting, resting and the bus take time.",
         "Do not repeat an action that has just failed: read why.",
-        "Plan the next stops and keep to the plan until something changes.",
+        "Plan the next stops and keep to the plan until something changes."
+        + ("" if compact else f" Any answer may be JSON that carries it, {_PLANNED}: it is shown to you again."),
     ]
 
 
@@ -119,7 +126,7 @@ def _menu(rules: Rules) -> list[str]:
     return [
         '"hurry" is a quarter faster than "go", but shakes fragile food and drains more per metre. A rented car costs '
         f"${rules.rental_per_min:.0f} a minute until it is returned; a drink gives energy, a pack fills the battery.",
-        '"more choices" turns the page and takes no time.',
+        '"more choices" turns the page and takes no time. What stands in brackets behind a choice is no part of it.',
     ]
 
 

@@ -1,0 +1,58 @@
+"""LoRA layers computed merged: PEFT's values and gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("trl")
+
+from tests.trainers.test_frozen import upper_lora
+from trainers.lora import merged_lora
+
+IDS = torch.arange(24).reshape(2, 12)
+
+
+def update(model: Any, merged: bool) -> list[torch.Tensor]:
+    """Logits, and gradients of the log-probabilities of some tokens."""
+    model.zero_grad()
+    if merged:
+        with merged_lora(model):
+            logits = model(input_ids=IDS, use_cache=False).logits
+    else:
+        logits = model(input_ids=IDS, use_cache=False).logits
+    logits.log_softmax(-1).gather(2, (IDS + 7)[..., None]).sum().backward()
+    return [logits.detach(), *(p.grad.clone() for p in model.parameters() if p.grad is not None)]
+
+
+@pytest.mark.parametrize("config", [{}, {"attention_bias": True}], ids=str)
+def test_values_and_gradients_are_those_of_peft(config: dict[str, Any]) -> None:
+    model = upper_lora("padded", **config)
+    for name, parameter in model.named_parameters():
+        if name.endswith("bias"):
+            torch.nn.init.normal_(parameter)
+    theirs, ours = update(model, merged=False), update(model, merged=True)
+    assert len(theirs) == len(ours) == 1 + 2 * 2 * 7
+    for a, b in zip(theirs, ours, strict=True):
+        assert float((a - b).norm()) <= 1e-5 * float(a.norm())
+
+
+def test_layers_are_themselves_again() -> None:
+    model = upper_lora("padded")
+    with merged_lora(model):
+        inside = [m for m in model.modules() if "forward" in vars(m)]
+    assert len(inside) == 2 * 7 and all(hasattr(m, "lora_A") for m in inside)
+    assert not any("forward" in vars(m) for m in inside)
+
+
+def test_what_is_not_plain_stays_with_peft() -> None:
+    model = upper_lora("padded")
+    for off in (lambda: model.gradient_checkpointing_enable(), lambda: model.to(torch.bfloat16)):
+        off()
+        with merged_lora(model):
+            assert not any("forward" in vars(m) for m in model.modules() if hasattr(m, "lora_A"))
+        model.gradient_checkpointing_disable()
+    with model.disable_adapter(), merged_lora(model):
+        assert not any("forward" in vars(m) for m in model.modules() if hasattr(m, "lora_A"))
