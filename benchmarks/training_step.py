@@ -326,18 +326,19 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     stock, ours = trainers_for(options.model, options.adapter)
-    results = {layout: run_layout(layout, stock, ours, options) for layout in options.layouts}
-    if options.json:
-        print(json.dumps(results))
-        return
-    for layout, r in results.items():
+    results = {}
+    for layout in options.layouts:
+        results[layout] = r = run_layout(layout, stock, ours, options)
         print(
             f"{layout:<13} ours {r['ours_s']:7.2f} s  trl {r['trl_s']:7.2f} s  ratio {r['ratio']:.2f}x  "
             f"(processor time {r['cpu_ratio']:.2f}x, alone {r['alone_cpu_ratio']:.2f}x)  "
-            f"utilisation {r['utilisation']:.0%}  "
-            f"memory {r['memory_ratio']:.2f}x  gradient difference {r['max_rel_grad_diff']:.1e}  "
-            f"packing {r['packing_ratio']:.2f}"
+            f"utilisation {r['utilisation']:.0%}  memory {r['memory_ratio']:.2f}x  "
+            f"gradient difference {r['max_rel_grad_diff']:.1e}  packing {r['packing_ratio']:.2f}",
+            file=sys.stderr if options.json else sys.stdout,
+            flush=True,
         )
+    if options.json:
+        print(json.dumps(results))
 
 
 if __name__ == "__main__":

@@ -275,6 +275,12 @@ class RoboThorEnv(Game):
             },
             "success": self.won,
             "metrics": self._metrics(),
+            "geodesic": {
+                "start": self.left_to_go.get(cell_at(self.episode.x, self.episode.z)),
+                "left": self._distance(),
+                "walked": self.walked,
+                "shortest": self.episode.length,
+            },
         }
 
     def _metrics(self) -> dict[str, Any]:
