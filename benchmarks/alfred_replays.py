@@ -15,8 +15,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.alfred.env import SETTINGS, set_up
 from agentspec.envs.alfred.goals import Changes, Progress, progress
+from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import Trial, read_trial
 from agentspec.envs.thor.engine import OfflineThor
 from agentspec.envs.thor.mining import household, objects_file
