@@ -69,6 +69,8 @@ class Declaration:
             within a dozen steps.
         small_calls: the call profile under each of `small`; `None`: as `calls`.
         scope: `run` for a method that is of no use within one episode: a spec with another scope is refused.
+        extra: the extra of this distribution that installs the library it is built on; empty: it needs none.
+        untrainable: why no policy can be trained inside it; empty: one can.
         name: name in a spec; empty: the name of the file in this package, outside it the class's name in snake case.
         aliases: other names.
     """
@@ -83,6 +85,8 @@ class Declaration:
     small: tuple[Mapping[str, Any], ...] = ()
     small_calls: CallProfile | None = None
     scope: str = ""
+    extra: str = ""
+    untrainable: str = ""
     name: str = ""
     aliases: tuple[str, ...] = ()
 

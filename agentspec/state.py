@@ -73,7 +73,8 @@ def dump_state(data: Any) -> bytes:
     Raises:
         TypeError: a key that is no string (JSON would turn it into one, and the state would restore unequal).
     """
-    return (joined(data).text if isinstance(data, list) else _text(data)).encode()
+    parts = isinstance(data, list) and any(isinstance(part, Json) for part in data)
+    return (joined(data).text if parts else _text(data)).encode()
 
 
 def load_state(blob: bytes) -> Any:

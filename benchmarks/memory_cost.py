@@ -2,9 +2,9 @@
 
     python -m benchmarks.memory_cost [--json] [--methods base amem] [--steps 20] [--preset rl] [--to DIR]
 
-Each registered memory under `react` plays the same shift of DeliveryBench for `--steps` steps (SmolLM2, sampled; the
-snapshot layout, in which memory is all that is known of earlier steps), with the preset `rl` where it has presets. Per
-step: calls, tokens in (and how many of them from the cache), tokens out; the wall-clock time of retrieval less its
+Each memory of this package under `react` plays the same shift of DeliveryBench for `--steps` steps (SmolLM2, sampled;
+the snapshot layout, in which memory is all that is known of earlier steps), with the preset `rl` where it has presets.
+Per step: calls, tokens in (and how many of them from the cache), tokens out; the wall-clock time of retrieval less its
 model calls; the state at the end; the share of memory's answers that could not be read, was cut off or did not fit.
 
 `--to DIR` writes one file a method, `DIR/NAME.json`, as soon as it has played, and `DIR/memory.md`, the table of all
@@ -220,7 +220,7 @@ def measure(
     Returns:
         the exit code: 1 if a method failed.
     """
-    everything = list(REGISTRY.all("memory"))
+    everything = [name for name, entry in REGISTRY.all("memory").items() if not entry.declaration.extra]
     wanted = [n if ":" in n else REGISTRY.get("memory", n).name for n in methods] or everything
     settings = {name: settings_of(name, **given) for name in dict.fromkeys([BASELINE, *wanted])}
     rows = {name: row for name in settings if (row := recorded(folder, name, settings[name])) and "failed" not in row}

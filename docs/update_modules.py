@@ -37,7 +37,8 @@ def call_table() -> str:
 
 
 def _rows(kind: str, name: str, entry: Entry) -> list[str]:
-    needs = ", ".join(need + _waiver(entry, need) for need in entry.needs)
+    extra = [f"extra `{entry.declaration.extra}`"] if entry.declaration.extra else []
+    needs = ", ".join([need + _waiver(entry, need) for need in entry.needs] + extra)
     rows = []
     for preset, profile in (entry.presets or {"": entry.calls}).items():
         counts = [_count(getattr(profile, occasion)) for occasion in OCCASIONS]

@@ -1,13 +1,14 @@
 """Write the prompt gallery, `docs/prompts/`: `python docs/update_prompts.py`. A test holds that it is current.
 
-One page per method. Every page shows the full prompt of an action at the third step, for both layouts and for native
-and menu actions of each environment, and what else the method asks at such a step. A scripted model answers; nothing of
-it is random, so a page changes only when a prompt does.
+One page per method, and one per memory (`memory_gallery`). A method's page shows the full prompt of an action at the
+third step, for both layouts and for native and menu actions of each environment, and what else the method asks at such
+a step. A scripted model answers; nothing of it is random, so a page changes only when a prompt does.
 """
 
 from __future__ import annotations
 
 import functools
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ from agentspec.spec import AgentSpec
 from agentspec.state import write_atomic
 from agentspec.tokens import estimate_tokens
 from agentspec.types import Task
+
+sys.path.insert(0, str(Path(__file__).parent))
+import memory_gallery
 
 FOLDER = Path(__file__).with_name("prompts")
 STEP = 2
@@ -160,7 +164,7 @@ def _fenced(text: str) -> str:
 @functools.cache
 def gallery() -> dict[str, str]:
     """File name -> page."""
-    pages = {f"{name}.md": page(name, spec) for name, spec in methods().items()}
+    pages = {f"{name}.md": page(name, spec) for name, spec in methods().items()} | memory_gallery.pages()
     index = "\n".join(f"- [`{name.removesuffix('.md')}`]({name})" for name in sorted(pages))
     order = (
         "What stands in a prompt, in this order: instruction, rules and actions of the environment; how to answer; "

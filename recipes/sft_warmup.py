@@ -1,9 +1,12 @@
-"""A supervised warm start from the rule-based courier, in the prompt layout that GRPO will use.
+"""A supervised warm start from a world's scripted expert, in the prompt layout that GRPO will use.
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
+    accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_minigrid.yaml
+    accelerate launch recipes/sft_warmup.py --environment '{"name": "alfred", "options": {"action_mode": "menu"}}'
 
-The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's `SFTTrainer` trains on
-the tokens the expert chose; prompts and observations are context.
+Any environment with an expert will do (`agentspec.envs.experts`). The first two made the adapters that ship
+(`agentspec/llm/shipped`). TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are
+context.
 """
 
 from __future__ import annotations

@@ -11,15 +11,13 @@ import math
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, Any, get_args
 
-from trl import GRPOConfig
-
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
-from agentspec.registry import SpecError
+from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS, estimator
-from trainers.fields import defaults, field_rules
+from trainers.fields import REFUSED, defaults, field_rules
 from trainers.losses import LOSSES, loss
 from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.writes import write_credit
@@ -92,10 +90,10 @@ def check_given(names: Iterable[str], where: str) -> None:
         names: keys of a YAML file, or options of a command line.
         where: what they were read from, for the message.
     """
-    rules = field_rules(GRPOConfig)
+    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
     for name in names:
-        if name in rules and rules[name].status == "refused":
-            raise SpecError(f"{where}: `{name}` is not read: {rules[name].why}")
+        if name in why:
+            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:
@@ -124,6 +122,8 @@ def check_values(config: ScaffoldConfig) -> None:
 
 def check_read(config: ScaffoldConfig) -> None:
     """No field that nobody reads has a value of its own: of TRL's in no configuration, of the others in this one."""
+    from trl import GRPOConfig
+
     for name, rule in field_rules(GRPOConfig).items():
         value = getattr(config, name, rule.allowed[0] if rule.allowed else None)
         if rule.status != "used" and value not in rule.allowed:
@@ -203,6 +203,11 @@ def check_calls(config: ScaffoldConfig) -> None:
             )
     temperatures = [("sampling.temperature", spec.sampling.temperature)]
     for kind in MODULE_KINDS:
+        if why := REGISTRY.get(kind, getattr(spec, kind).name).declaration.untrainable:
+            raise SpecError(
+                f"agent.{kind} {getattr(spec, kind).name!r} cannot be trained through: {why}; train inside a method of "
+                "this package, and evaluate with this one"
+            )
         if any(config.train_filter.matches(p) for p in paths if p.startswith(f"{kind}.")):
             given = getattr(spec, kind).params.items()
             temperatures += [(f"{kind}.{n}", v) for n, v in given if n.endswith("temperature") and v is not None]

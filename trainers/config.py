@@ -7,17 +7,16 @@ or would not be exact is refused at start, with the reason and the remedy (`trai
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from trl import GRPOConfig
 
 from agentspec.carry import start_bank
-from agentspec.registry import SpecError
+from agentspec.llm.models import base_of
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
+from trainers.ahead import check_world, structure
 from trainers.checks import check
 from trainers.credit import CreditRule
 from trainers.sequences import TrainFilter
@@ -140,9 +139,7 @@ class ScaffoldConfig(GRPOConfig):
 
     def __post_init__(self) -> None:
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
-            value = getattr(self, name)
-            if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
-                setattr(self, name, _json(name, value))
+            setattr(self, name, structure(getattr(self, name)))
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -155,7 +152,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def spec(self) -> AgentSpec:
         """The training scaffold."""
-        return agent_spec(self.agent)
+        return agent_spec(self.agent).with_base(base_of(self.model))
 
     @property
     def credit_rule(self) -> CreditRule:
@@ -172,13 +169,9 @@ class ScaffoldConfig(GRPOConfig):
         """Name and options of the environment.
 
         Raises:
-            SpecError: not of the form `{name: ..., options: {...}}`.
+            SpecError: not of the form `{name: ..., options: {...}}`, an unknown name or option.
         """
-        value = self.environment or "deliverybench"
-        given: dict[str, Any] = {"name": value} if isinstance(value, str) else value
-        if not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
-            raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")
-        return given["name"], dict(given.get("options") or {})
+        return check_world(self.environment or "deliverybench")
 
     @property
     def validates(self) -> bool:
@@ -193,7 +186,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def other_specs(self) -> list[AgentSpec]:
         """Agent specs to validate under, beside the training scaffold."""
-        return [agent_spec(s) for s in _listed(self.validation_specs or [])]
+        return [agent_spec(s).with_base(base_of(self.model)) for s in _listed(self.validation_specs or [])]
 
     @property
     def evaluation_sampling(self) -> dict[str, Any]:
@@ -230,11 +223,3 @@ def agent_spec(value: Any) -> AgentSpec:
 
 def _listed(specs: list[Any] | str) -> list[Any]:
     return [specs] if isinstance(specs, str) else list(specs)
-
-
-def _json(name: str, text: str) -> Mapping[str, Any] | list[Any]:
-    try:
-        data: Mapping[str, Any] | list[Any] = json.loads(text)
-    except ValueError as error:
-        raise SpecError(f"{name}: not valid JSON ({error}); quote keys and strings with double quotes") from error
-    return data

@@ -25,7 +25,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    DATA,
+    brief,
+    distinct,
+    first_held,
+    goal_of,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -41,7 +52,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"every": 10, "overview_every": 5, "answer_tokens": 256, "steps_tokens": 1600},
     "rl": {"every": 16, "overview_every": 0, "answer_tokens": 128, "steps_tokens": 768},
 }
-TASK_TOKENS = 64
 NEXT_EPISODE = "[Plan for the next episode]"
 
 HEAD = (
@@ -202,14 +212,15 @@ class MemoryBank:
             items.append(RecallItem(self._plan, 1.0, "insight", priority=2.5))
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
-            items += [RecallItem(self._named(e), 1.0, priority=4.0 + e.step) for e in newest]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
         text = step_text(transition, self.state_tokens, self.services.llm.count_tokens)
         self._add("raw", text, transition.step)
         self._held_from = first_held(self.services, transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, self.services.llm.count_tokens)
+        self._task = goal_of(transition.input.instruction, self.services.llm.count_tokens)
         ended = transition.terminated or transition.truncated
         if not ended and transition.step + 1 - self._day_began >= self.every:
             await self._close_day(transition.step + 1)
@@ -327,9 +338,10 @@ class MemoryBank:
         found: list[tuple[int, float]] = []
         for kind, index in self._index.items():
             hidden = max(0, now.step - shown_from) if kind == "raw" else 0
-            hits = index.search(query, self.quota[kind] + hidden) if self.quota[kind] else []
+            hits = index.search(query, 2 * self.quota[kind] + hidden) if self.quota[kind] else []
             if kind == "raw":
                 hits = [h for h in hits if not self._is_shown(self.entries[h[0]], now.episode, shown_from)]
+                hits = distinct(hits, lambda key: self.entries[key].text)
             found += hits[: self.quota[kind]]
         return found
 

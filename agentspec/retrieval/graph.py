@@ -48,6 +48,11 @@ class Graph(Generic[N]):
         for neighbour in self._adjacent.pop(node, {}):
             self._adjacent[neighbour].pop(node)
 
+    def disconnect(self, a: N, b: N) -> None:
+        """Remove the edge between two nodes; one that is not there is ignored."""
+        if b in self._adjacent.get(a, {}):
+            del self._adjacent[a][b], self._adjacent[b][a]
+
     def neighbours(self, node: N) -> Mapping[N, float]:
         """Neighbours of `node` with the weights of the edges."""
         return self._adjacent[node]

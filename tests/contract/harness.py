@@ -76,11 +76,15 @@ class Case:
 
 
 def cases(kinds: tuple[str, ...] = KINDS) -> list[Case]:
-    """Every module of this package that is not tied to an environment, with each set of parameters."""
+    """Every module of this package that is not tied to an environment, with each set of parameters.
+
+    Memories of libraries are not among them (`tests/memory/test_libraries.py` says what they keep to).
+    """
     found = []
     for kind in kinds:
         for name, entry in REGISTRY.all(kind).items():
-            if not entry.scripted and entry.target.startswith("agentspec."):
+            library = bool(entry.declaration.extra)
+            if not entry.scripted and not library and entry.target.startswith("agentspec."):
                 found += variants(kind, name, entry)
     return found
 

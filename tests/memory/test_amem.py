@@ -102,7 +102,7 @@ def test_links_are_followed_one_way_and_at_most_as_many_as_were_asked_for() -> N
     memory = AMem(services(Asked(analyse=PLAIN, evolve=STAY)))
     learn(memory, "red key", "far hill", "old mill", "green boat")
     notes = memory.notes
-    notes[0].links = [1, 2, 9]  # 9 is gone
+    memory._change(notes[0], links=[1, 2, 9])  # 9 is gone
     assert recalled(memory, "red key", 1) == ["n0", "n1"]
     assert recalled(memory, "far hill", 1) == ["n1"]
     assert "over" not in memory._shown(notes[0])
@@ -111,7 +111,7 @@ def test_links_are_followed_one_way_and_at_most_as_many_as_were_asked_for() -> N
     # The two nearest are n0 and, of the notes that share no word but the labels, one more; links fill up to two others.
     nearest, linked = recalled(memory, "red key", 2)[:2], recalled(memory, "red key", 2)[2:]
     assert nearest[0] == "n0" and linked == [n for n in ("n1", "n2") if n not in nearest]
-    assert notes[0].recalled == 3 and notes[3].recalled == 2 * ("n3" in nearest)
+    assert memory.notes[0].recalled == 3 and memory.notes[3].recalled == 2 * ("n3" in nearest)
 
 
 @pytest.mark.parametrize("bad", ["", "prose", '{"keywords": "key"}', '{"keywords": ["k"], "context": 3}'])

@@ -71,6 +71,18 @@ def test_nodes_that_go_leave_what_was_never_linked_to_them(edges: list[tuple[int
     again = Level()
     again.load(level.state())
     assert again.state() == level.state()
+    assert (again.replicas, list(again.labels.items())) == (level.replicas, list(level.labels.items()))
+    split = replica_graph(level.graph, level.replicas)  # every cluster hangs together
+    for label in set(level.labels.values()):
+        assert len(split.components(r for r, other in level.labels.items() if other == label)) == 1
+
+
+def test_a_cluster_that_falls_apart_becomes_two() -> None:
+    level = level_of((0, 1), (1, 2), (2, 0), (2, 3), (3, 4), (4, 2))
+    level.labels = dict.fromkeys(level.labels, 7)  # as if a label had spread everywhere, and its bridge gone since
+    level.fresh = 8
+    level.touch([2])
+    assert sorted(sorted(c) for c in level.clusters().values()) == [[0, 1, 2], [2, 3, 4]]
 
 
 def test_a_part_of_the_graph_that_is_not_touched_keeps_its_cluster() -> None:

@@ -12,6 +12,7 @@ from agentspec.memory.generative import GenerativeMemory
 from agentspec.memory.generative.stream import Memory, Stream, Weights, normalised
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import AgentSpec
+from agentspec.state import dump_state, load_state
 from tests.memory.one_step import TASK, Asked, seen, services, step
 from tests.memory.recall_world import succeeds
 
@@ -91,7 +92,7 @@ def test_over_capacity_the_one_used_longest_ago_goes() -> None:
     assert [m.id for m in made] == [0, 7] and made.evicted == 1
     assert [made.importance(id) for id in (0, 7)] == [1, 3] and 1 not in made
     other = Stream(Two(), made.weights, 2)
-    other.load(json.loads(json.dumps(made.state())))
+    other.load(load_state(dump_state([made.state()]))[0])
     assert other.state() == made.state() and np.array_equal(other.scores("query", 7), made.scores("query", 7))
 
 

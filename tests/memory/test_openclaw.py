@@ -141,8 +141,8 @@ def test_decay_halves_at_the_half_life() -> None:
 
 
 def test_the_dreaming_score_in_numbers() -> None:
-    chunk = Chunk("order 17 pays $5.40 at restaurant 5", episode=0, step=3, recalls=4, relevance=2.0)
-    chunk.queries, chunk.episodes = ["a", "b", "c"], [0, 1]
+    recalled = {"recalls": 4, "relevance": 2.0, "queries": ("a", "b", "c"), "episodes": (0, 1)}
+    chunk = Chunk("order 17 pays $5.40 at restaurant 5", episode=0, step=3, **recalled)
     # relevance 2/4; frequency ln 5 / ln 11 = .6712; diversity 3/5; age 1 of half-life 1: .5; 2/3 of 3 episodes;
     # rich terms: 17, 5.40, restaurant, 5 = 4 of 6.
     assert signals(chunk, 1, 1.0) == pytest.approx(
@@ -196,7 +196,9 @@ def test_nothing_to_keep_is_no_note() -> None:
 
 
 def dreamer(answer: str) -> OpenClaw:
-    memory = claw(Asked(learn=NONE, dream=answer), least_score=0.1, least_recalls=2, least_queries=2, recent=0)
+    memory = claw(
+        Asked(learn=NONE, dream=answer), least_score=0.1, least_recalls=2, least_queries=2, recent=0, least=0.0
+    )
     for name in "abcd":
         memory._apply(Edit("add", name, f"Rule {name}."))
     memory.begin_episode(TASK)
@@ -273,10 +275,17 @@ def test_the_log_is_bounded_and_snapshots_are_exact() -> None:
 
 
 def test_nothing_is_shown_twice() -> None:
-    memory = claw(every=100, search=6, recent=2)
-    learn(memory, *(step(i, f"room {i}") for i in range(6)))
+    memory = claw(every=100, search=6, recent=2, least=0.0)
+    learn(memory, *(step(i, f"room {i}") for i in range(11)))
     shown = recall(memory, "room 5")
-    assert len(shown) == len(set(shown)) == 6
+    # The newest two, and of the nine others a third.
+    assert len(shown) == len(set(shown)) == 5
+
+
+def test_search_shows_what_scores_enough() -> None:
+    memory = claw(every=100, search=6, recent=2, least=0.99)
+    learn(memory, *(step(i, f"room {i}") for i in range(11)))
+    assert len(recall(memory, "room 5")) == 2
 
 
 def test_bad_parameters_are_refused() -> None:

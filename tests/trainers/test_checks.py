@@ -17,7 +17,8 @@ import transformers
 import trl
 from trl import GRPOConfig
 
-from agentspec.registry import SpecError
+from agentspec.declaration import Declaration
+from agentspec.registry import REGISTRY, Entry, SpecError
 from trainers.arguments import parse_config
 from trainers.checks import check_given, check_reporters, notes
 from trainers.config import ScaffoldConfig
@@ -69,6 +70,18 @@ def test_fields_that_are_called_used_are_named_by_who_uses_them() -> None:
 def test_the_defaults_are_not_refused(tmp_path: Path) -> None:
     config(tmp_path).check()
     config(tmp_path, eval_strategy="steps", eval_steps=2, save_steps=2).check()
+
+
+def test_a_module_that_cannot_be_played_again_is_refused(tmp_path: Path) -> None:
+    declaration = Declaration(untrainable="its prompts hold the date")
+    REGISTRY.register("memory", "dated", Entry("agentspec.memory.base:BaseMemory", declaration))
+    try:
+        with pytest.raises(
+            SpecError, match=r"agent\.memory .dated. cannot be trained through: its prompts hold the date"
+        ):
+            config(tmp_path, agent={"memory": "dated"}).check()
+    finally:
+        REGISTRY.unregister("memory", "dated")
 
 
 @pytest.mark.parametrize("name", [n for n, rule in RULES.items() if rule.status != "used" and n in INHERITED])

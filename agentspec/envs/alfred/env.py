@@ -26,7 +26,7 @@ from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
 from agentspec.envs.thor.names import Names, direction, whereabouts
 from agentspec.envs.thor.protocol import Event, Thor
-from agentspec.envs.thor.scene import Scene
+from agentspec.envs.thor.scene import Scene, cell_at
 from agentspec.envs.thor.sight import AGENT_HEIGHT, Camera
 from agentspec.envs.thor.ways import way_to_see
 from agentspec.metrics import Metric
@@ -142,7 +142,10 @@ class AlfredEnv(Game):
     def _scene(self, trial: Trial) -> Scene:
         if trial.id.startswith("own_"):
             return room(trial.scene)
-        return household(trial.scene, self._data, self._objects, self._layouts)
+        scene = household(trial.scene, self._data, self._objects, self._layouts)
+        start = cell_at(trial.start["x"], trial.start["z"])
+        # a trial that is not among those the scene was mined from starts where it says
+        return scene if start in scene.cells else replace(scene, cells=scene.cells | {start})
 
     def _begin(self, seed: int) -> None:
         self.trial = self.trial_of(seed)
@@ -230,6 +233,7 @@ class AlfredEnv(Game):
             },
             "success": self.progress.success,
             "metrics": self._metrics(),
+            "goal_conditions": self.progress.share,
         }
 
     def _listed(self) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ The conditions are those of ALFRED's evaluation: each task type has a fixed numb
 at once. They read metadata only, so they hold for every player. As there, an object counts as of a type when its id
 contains the type's name (`Apple|..|AppleSliced_1` is an `AppleSliced`, and an `Apple` too).
 
-- clean: a tap is turned on; everything in the basin nearest to it becomes clean;
+- clean: a tap is turned on; everything in the sink basin nearest to it becomes clean;
 - heat: a microwave is turned on; everything in it becomes hot;
 - cool: a fridge is closed; everything in it becomes cold.
 """
@@ -55,7 +55,7 @@ class Changes:
 def _basin(objects: Iterable[Object], faucet_id: str) -> Iterable[str]:
     objects = list(objects)
     faucet = next((o for o in objects if o["objectId"] == faucet_id), None)
-    basins = [o for o in objects if "SinkBasin" in o["objectId"] or "BathtubBasin" in o["objectId"]]
+    basins = [o for o in objects if "SinkBasin" in o["objectId"]]
     if faucet is None or not basins:
         return ()
     here = tuple(faucet["position"].values())

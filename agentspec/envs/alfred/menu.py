@@ -160,8 +160,11 @@ def _go(env: AlfredEnv, name: str) -> tuple[str, str, str]:
         return (
             ("", f"there is no way to see {name} from here", "no_way") if way is None else (f"{name} is here", "", "")
         )
-    left = env.left
-    for command in way[:left]:
+    walked = 0
+    for command in way[: env.left]:
         env.act({"action": command})
-    arrived = "went to" if len(way) <= left else "was on the way to"
-    return f"{arrived} {name}, {min(len(way), left)} steps", "", ""
+        walked += 1
+        if env._over():
+            break
+    arrived = "went to" if walked == len(way) else "was on the way to"
+    return f"{arrived} {name}, {walked} steps", "", ""

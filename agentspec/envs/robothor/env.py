@@ -85,7 +85,7 @@ class RoboThorEnv(Game):
         objects: folder with recorded object metadata; default: `objects` two folders above `data`.
         action_mode: `native` calls, or a `menu` of six phrases.
         reward: `success` (1 for it) or `progress` (besides, metres come nearer to the target over the shortest path's
-            length, clipped by the metres moved).
+            length, clipped to -1..1).
         max_steps: instead of the preset's.
         images: put the egocentric picture into the observation.
         render_mode: None or "rgb_array".
@@ -184,8 +184,8 @@ class RoboThorEnv(Game):
         self.event = self.world.step(start)
         if not self.event.success:
             raise ValueError(f"episode {e.id} does not fit scene {e.scene}: {self.event.error}")
-        self.walked, self.won, self.earned = 0.0, False, 0.0
-        self.left_to_go = self.world.distance(e.target)
+        self.walked, self.won = 0.0, False
+        self.far = self.near = self.left_to_go = self.world.distance(e.target)
         self.names = Names()
         self.names.add(self.event.metadata["objects"])
 
@@ -194,16 +194,12 @@ class RoboThorEnv(Game):
 
     def _carry_out(self, action: Action) -> None:
         call = next(name for name, (_, phrase, _) in CALLS.items() if action.name in (name, phrase))
-        at, before = self.event.metadata["agent"]["position"], self.left_to_go
+        at = self.event.metadata["agent"]["position"]
         event = self.act({"action": CALLS[call][0]})
         now = event.metadata["agent"]["position"]
-        moved = math.hypot(now["x"] - at["x"], now["z"] - at["z"])
-        self.walked += moved
+        self.walked += math.hypot(now["x"] - at["x"], now["z"] - at["z"])
         if call == "STOP":
             self.stopped, self.won = True, self._in_view()
-        after = self.left_to_go
-        if before is not None and after is not None:
-            self.earned += max(-moved, min(moved, before - after)) / max(self.episode.length, 1.0)
         # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
         self.told = Told(CALLS[call][2] if event.success else f"could not {CALLS[call][1]}, {event.error}")
 
@@ -212,6 +208,7 @@ class RoboThorEnv(Game):
         self.event = super().act(action)
         if str(action["action"]).startswith("Move"):
             self.left_to_go = self.world.distance(self.episode.target)
+            self.near = self.near if self.left_to_go is None else self.left_to_go
         return self.event
 
     def _in_view(self) -> bool:
@@ -219,7 +216,16 @@ class RoboThorEnv(Game):
         return any(o["visible"] and o["objectType"] == self.episode.target for o in objects)
 
     def _value(self) -> float:
-        return float(self.won) + (self.earned if self._reward == "progress" else 0.0)
+        return float(self.won) + (self._nearer() if self._reward == "progress" else 0.0)
+
+    def _nearer(self) -> float:
+        """Metres come nearer since the start over the shortest path's length (at least 1 m), within -1..1.
+
+        It depends on where the agent is, not on how it got there, so that no loop earns anything.
+        """
+        if self.far is None or self.near is None:
+            return 0.0
+        return max(-1.0, min(1.0, (self.far - self.near) / max(self.episode.length, 1.0)))
 
     # -- reporting ---------------------------------------------------------------------------------------------
 
@@ -269,6 +275,12 @@ class RoboThorEnv(Game):
             },
             "success": self.won,
             "metrics": self._metrics(),
+            "geodesic": {
+                "start": self.left_to_go.get(cell_at(self.episode.x, self.episode.z)),
+                "left": self._distance(),
+                "walked": self.walked,
+                "shortest": self.episode.length,
+            },
         }
 
     def _metrics(self) -> dict[str, Any]:
@@ -287,10 +299,10 @@ class RoboThorEnv(Game):
     # -- exact state -------------------------------------------------------------------------------------------
 
     def _records(self) -> dict[str, Any]:
-        return {"walked": self.walked, "won": self.won, "earned": self.earned}
+        return {"walked": self.walked, "won": self.won, "near": self.near}
 
     def _recall(self, records: Mapping[str, Any]) -> None:
-        self.walked, self.won, self.earned = records["walked"], records["won"], records["earned"]
+        self.walked, self.won, self.near = records["walked"], records["won"], records["near"]
         self.event, self.left_to_go = self.world.observe(), self.world.distance(self.episode.target)
 
 

@@ -183,6 +183,8 @@ class OfflineThor:
 
     def _way(self, wanted: str) -> tuple[dict[Cell, float], dict[Cell, Cell]]:
         """`geodesic.distances` to where an object is seen; searched once until an object changes."""
+        if wanted in self.scene.sights:
+            return self.scene.ways(wanted)
         if wanted not in self._ways:
             self._ways[wanted] = distances(self.viewpoints(wanted), self.scene.cells)
         return self._ways[wanted]

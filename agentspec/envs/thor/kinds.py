@@ -64,8 +64,8 @@ def _read(table: str) -> dict[str, Kind]:
 
 KINDS: dict[str, Kind] = _read(_TABLE)
 UNKNOWN = Kind(frozenset(), (0.2, 0.2, 0.2))
-SLICES = {"Apple": 5, "Bread": 6, "Lettuce": 5, "Potato": 5, "Tomato": 5, "Egg": 1}
-"""Sliceable type -> pieces that slicing leaves (an egg is cracked)."""
+SLICES = {"Apple": 5, "Bread": 6, "Lettuce": 6, "Potato": 5, "Tomato": 6, "Egg": 1}
+"""Sliceable type -> pieces that slicing leaves, at least as many as recorded plans name (an egg is cracked)."""
 
 KNIVES = frozenset({"Knife", "ButterKnife"})
 

@@ -61,8 +61,8 @@ def put(world: OfflineThor, action: Action) -> None:
     if held is None:
         raise Refused("the hand is empty, there is nothing to put")
     target = _target(world, action, "receptacleObjectId", "receptacle")
-    if target.id == held.id:
-        raise Refused("an object cannot be put into itself")
+    if target.id == held.id or held.id in target.parents:
+        raise Refused("an object cannot be put into itself, nor into what is in it")
     if target.closed:
         raise Refused(f"{target.id} is closed; open it first")
     spot = free_spot(world, held, target, bool(action.get("forceAction")))
@@ -82,7 +82,7 @@ def free_spot(world: OfflineThor, one: Body, target: Body, crowd: bool) -> list[
     With `crowd` the places taken are used too, once all are: AI2-THOR's forced placement.
     """
     (w, h, d), (tw, th, td) = one.size, target.size
-    if min(w, d) > 1.1 * max(tw, td) and not crowd:
+    if min(w, d) > (2.5 if crowd else 1.1) * max(tw, td):
         return None
     low = target.low
     inner = "openable" in target.abilities or target.type in ("Box", "SinkBasin", "BathtubBasin", "GarbageCan", "Cup")
@@ -157,8 +157,8 @@ def cut(world: OfflineThor, action: Action) -> None:
     del world.state.bodies[one.id]
     count = SLICES.get(one.type, 4)
     width, height, depth = one.size
-    for number in range(count):
-        x = one.centre[0] + width * ((number + 0.5) / count - 0.5)
+    for number in range(1, count + 1):
+        x = one.centre[0] + width * ((number - 0.5) / count - 0.5)
         made = f"{one.id}|{piece(one.type)}_{number}"
         centre = [x, one.centre[1], one.centre[2]]
         bottom = [x, one.low[1], one.centre[2]]

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
 
 from agentspec.envs.thor.kinds import kind
 
@@ -24,8 +27,11 @@ def cell_at(x: float, z: float) -> Cell:
 
 
 def object_id(type_name: str, position: Iterable[float]) -> str:
-    """AI2-THOR's id of an object that starts at `position`: `Apple|-00.59|+00.83|-00.40`."""
-    return "|".join([type_name, *(f"{value:+06.2f}" for value in position)])
+    """AI2-THOR's id of an object that starts at `position`: `Apple|-00.59|+00.83|-00.40`.
+
+    The simulator rounds single-precision numbers: -1.835 becomes `-01.84`.
+    """
+    return "|".join([type_name, *(f"{np.float32(value):+06.2f}" for value in position)])
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,18 @@ class Scene:
     def __post_init__(self) -> None:
         if not self.cells:
             raise ValueError(f"the scene {self.name!r} has no cell to stand on")
+
+    def ways(self, name: str) -> tuple[dict[Cell, float], dict[Cell, Cell]]:
+        """`geodesic.distances` to the known sight cells of a type; searched once for a scene."""
+        from agentspec.envs.thor.geodesic import distances
+
+        if name not in self._ways:
+            self._ways[name] = distances(self.sights[name], self.cells)
+        return self._ways[name]
+
+    @cached_property
+    def _ways(self) -> dict[str, tuple[dict[Cell, float], dict[Cell, Cell]]]:
+        return {}
 
     @property
     def area(self) -> tuple[float, float, float, float]:

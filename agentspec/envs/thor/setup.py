@@ -65,7 +65,9 @@ def _posed(type_name: str, name: str, model: Body | None, pose: Mapping[str, Any
     offset = offset if max(map(abs, offset)) < 0.5 else [0.0, size[1] / 2, 0.0]
     centre = [q + o for q, o in zip(position, offset, strict=True)]
     abilities = model.abilities if model else sorted(kind(type_name).abilities)
-    return Body(object_id(type_name, position), type_name, name, centre, size, position, yaw, abilities)
+    made = Body(object_id(type_name, position), type_name, name, centre, size, position, yaw, abilities)
+    made.open = bool(model and model.open) or (model is None and type_name == "Laptop")
+    return made
 
 
 def set_object_toggles(world: OfflineThor, action: Action) -> None:

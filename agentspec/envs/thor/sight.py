@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from agentspec.envs.thor.geodesic import distances
-from agentspec.envs.thor.scene import Cell, Scene, cell_at
+from agentspec.envs.thor.scene import Scene, cell_at
 from agentspec.envs.thor.state import Agent, Body, State
 
 Floats = npt.NDArray[np.float64]
@@ -98,9 +97,7 @@ class Sight:
     def __init__(self, scene: Scene, camera: Camera, reach: float, slack: float = 1.0) -> None:
         self.camera, self.reach, self.slack = camera, reach, slack
         self._walls = [(np.array(c) - np.array(s) / 2, np.array(c) + np.array(s) / 2) for c, s in scene.walls]
-        self._near: dict[str, dict[Cell, float]] = {
-            name: distances(cells, scene.cells)[0] for name, cells in scene.sights.items()
-        }
+        self._scene = scene
 
     def refresh(self, state: State) -> None:
         """Read the boxes of `state`: call it after objects moved, opened or appeared."""
@@ -108,7 +105,7 @@ class Sight:
         self._bodies = bodies
         self._low = np.array([b.low for b in bodies]).reshape(-1, 3)
         self._high = np.array([b.high for b in bodies]).reshape(-1, 3)
-        shut = {b.id for b in bodies if b.closed}
+        shut = {b.id for b in bodies if b.closed or b.held}  # what is in something that is carried goes with it
         self._hidden = np.array([any(p in shut for p in b.parents) for b in bodies], bool)
         volume = np.prod(self._high - self._low, axis=1)
         self._blocking = [
@@ -160,8 +157,9 @@ class Sight:
         return found
 
     def _walkable(self, one: Body, agent: Agent) -> bool:
-        near = self._near.get(one.type)
-        return near is None or near.get(cell_at(agent.x, agent.z), math.inf) <= self.slack + 1e-9
+        if one.type not in self._scene.sights:
+            return True
+        return self._scene.ways(one.type)[0].get(cell_at(agent.x, agent.z), math.inf) <= self.slack + 1e-9
 
     def _clear(self, one: Body, points: Floats, eye: Floats) -> bool:
         """Whether one of the points is hidden by nothing: not by walls, nor by large boxes it is no part of."""

@@ -36,8 +36,8 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
 PRESETS = {
-    "paper": {"every": 1, "top": 10, "step_tokens": 256, "answer_tokens": 384, "repairs": 1},
-    "rl": {"every": 6, "top": 4, "step_tokens": 64, "answer_tokens": 160, "repairs": 0},
+    "paper": {"every": 1, "top": 10, "step_tokens": 256, "note_tokens": 96, "answer_tokens": 384, "repairs": 1},
+    "rl": {"every": 6, "top": 2, "step_tokens": 64, "note_tokens": 200, "answer_tokens": 160, "repairs": 0},
 }
 MOST_HISTORY = 4
 """Earlier contexts that a note remembers."""
@@ -83,21 +83,22 @@ class AMem:
         top: int | None = None,
         neighbours: int = 5,
         step_tokens: int | None = None,
-        note_tokens: int = 96,
+        note_tokens: int | None = None,
         answer_tokens: int | None = None,
         repairs: int | None = None,
         capacity: int = 2000,
     ) -> None:
-        given = {"every": every, "top": top, "step_tokens": step_tokens, "answer_tokens": answer_tokens}
+        given = {"every": every, "top": top, "step_tokens": step_tokens, "note_tokens": note_tokens}
+        given |= {"answer_tokens": answer_tokens}
         chosen: dict[str, int] = settings("amem", PRESETS, preset, {**given, "repairs": repairs})
         positive = {name: value for name, value in chosen.items() if name != "repairs"}
-        at_least("amem", 1, neighbours=neighbours, note_tokens=note_tokens, capacity=capacity, **positive)
+        at_least("amem", 1, neighbours=neighbours, capacity=capacity, **positive)
         at_least("amem", 0, repairs=chosen["repairs"])
         self.services = services
         self.every, self.top, self.neighbours = chosen["every"], chosen["top"], neighbours
         self.step_tokens, self.note_tokens, self.answer_tokens = (
             chosen["step_tokens"],
-            note_tokens,
+            chosen["note_tokens"],
             chosen["answer_tokens"],
         )
         self.repairs = min(1, chosen["repairs"])

@@ -195,15 +195,17 @@ class CamMemory:
             await self._grow(input.instruction)
         found = await self._pick(input.text, k) if self.read == "model" and len(self.nodes) else None
         if found is None:
-            found = self.nodes.near(input.text, k or self.top)
+            top = k or self.top
+            near = self.nodes.near(input.text, 2 * top)
+            found = list({node.text: (node, score) for node, score in reversed(near)}.values())[::-1][:top]
         notes = [(self.shown(node), score) for node, score in found]
         lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(notes, lines, self.services.llm.module)
 
     async def _pick(self, state: str, k: int | None) -> list[tuple[Entry, float]] | None:
         """Prune and grow: the model picks among candidates, and these lead to the next ones."""
-        similar = dict(self._scored(state))
-        candidates = list(similar)[: self.seeds]
+        similar = {node.id: score for node, score in self.nodes.near(state, self.seeds)}
+        candidates = list(similar)
         picked: dict[int, None] = {}
         seen = dict.fromkeys(candidates)
         for number in range(self.rounds):
@@ -212,14 +214,12 @@ class CamMemory:
                 return None
             picked |= dict.fromkeys(useful or ())
             grown = dict.fromkeys(n for id in useful or () for n in self._next_to(id) if n not in seen)
-            candidates = sorted(grown, key=lambda id: -similar.get(id, -1.0))[: self.seeds]
+            similar |= {id: self.nodes.similarity(state, id) for id in grown}
+            candidates = sorted(grown, key=lambda id: -similar[id])[: self.seeds]
             if not candidates:
                 break
             seen |= dict.fromkeys(candidates)
-        return [(self.nodes[id], similar.get(id, 0.0)) for id in list(picked)[: k or self.top]]
-
-    def _scored(self, state: str) -> list[tuple[int, float]]:
-        return [(node.id, score) for node, score in self.nodes.near(state, len(self.nodes))]
+        return [(self.nodes[id], similar[id]) for id in list(picked)[: k or self.top]]
 
     def _next_to(self, id: int) -> list[int]:
         """Neighbours on the same level, and children."""

@@ -7,9 +7,10 @@ what must not be lost. Between episodes, *dreaming* moves into `MEMORY.md` what 
 
 AgentSpec's form: procedural memory of lessons, refined along the trajectory. Every `every` steps one call edits rules
 and skills by name (edits are applied by code; what they do not name stays as it is). Skill and log entries are chosen
-by similarity to the observation, without a call. The workspace is virtual, a mapping of paths to text, and can be
-written to disk (`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of
-4,000 tokens of a window of 200,000 are shares of the model's window.
+by similarity to the observation, without a call; of the log at most a third of what there is to choose from, so that a
+short episode is not shown whole. The workspace is virtual, a mapping of paths to text, and can be written to disk
+(`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of 4,000 tokens of
+a window of 200,000 are shares of the model's window.
 
 Cost per step: none to retrieve; 1 call per `every` steps; 1 per cut of the conversation; at most 2 at an episode's end,
 and only where a later episode starts from this one's memory. `preset: paper` stands for ReAct + OpenClaw in its tables.
@@ -18,19 +19,29 @@ and only where a later episode starts from this one's memory. `preset: paper` st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.openclaw.files import FileTree, Skill, one_line, rule_name, rules_of, rules_text, skills_in, slug
+from agentspec.memory.openclaw.log import Log
 from agentspec.memory.openclaw.prompts import DREAM, FLUSH, HEAD, LEARN, NOTHING
-from agentspec.memory.openclaw.search import Chunk, decay, dream_score, hybrid, kept_share
-from agentspec.memory.parts.steps import first_held, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.openclaw.search import Chunk, decay, dream_score, kept_share
+from agentspec.memory.parts.steps import (
+    brief,
+    distinct,
+    first_held,
+    goal_of,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
-from agentspec.retrieval import Lexical, VectorIndex
-from agentspec.state import dump_state, keyed, load_state
+from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -40,7 +51,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"every": 2, "search": 6, "answer_tokens": 320, "steps_tokens": 768},
     "rl": {"every": 8, "search": 3, "answer_tokens": 192, "steps_tokens": 640},
 }
-TASK_TOKENS = 64
 TURN_TOKENS = 96
 NOTES = 6
 EDITS = 3
@@ -78,7 +88,8 @@ class OpenClaw:
     Args:
         preset: `paper` (edits after every 2 steps, 6 log entries searched) or `rl` (every 8 steps, 3 entries).
         every: steps between edits.
-        search: log entries that search shows in a step.
+        search: log entries that search shows in a step, at most a third of those that it chooses from.
+        least: smallest score of a log entry that search shows (upstream's `minScore`).
         recent: newest steps that are always shown where no conversation shows them.
         skills: folder with skills of your own (`NAME/SKILL.md`); one that is learnt replaces one of the same name.
         skills_shown: skills whose body is shown in a step.
@@ -130,6 +141,7 @@ class OpenClaw:
         preset: str = "paper",
         every: int | None = None,
         search: int | None = None,
+        least: float = 0.35,
         recent: int = 3,
         skills: str = "",
         skills_shown: int = 1,
@@ -166,10 +178,10 @@ class OpenClaw:
                 "and soft below 1 together"
             )
         self.services = services
-        self.recent, self.skills_shown, self.skill_least = recent, skills_shown, skill_least
+        self.least, self.recent, self.skills_shown, self.skill_least = least, recent, skills_shown, skill_least
         self.diverse, self.half_life = diverse, half_life
         self.memory_tokens, self.skill_tokens = memory_tokens, skill_tokens
-        self.max_skills, self.max_log = max_skills, max_log
+        self.max_skills = max_skills
         self.reserve, self.soft, self.keep = reserve, soft, keep
         self.window = window or services.context.window
         self.gate = (least_score, least_recalls, least_queries)
@@ -177,12 +189,11 @@ class OpenClaw:
         self.given = {slug(s.name): s for s in skills_in(skills)} if skills else {}
         self.rules: dict[str, str] = {}  # in the order in which they were written last
         self.skills: dict[str, Skill] = {}
-        self.log: dict[int, Chunk] = {}
+        self.log = Log(services.embedder, max_log)
         self._since, self._held_from = 0, 0  # steps of this episode
         self._flushed = False
         self._task = ""
         self._counts = {"edits": 0, "cuts": 0, "promoted": 0, "rewrites_refused": 0}
-        self._build_indices()
 
     def begin_episode(self, task: Task) -> None:
         self._since, self._held_from, self._flushed = 0, 0, False
@@ -195,22 +206,22 @@ class OpenClaw:
             for name, text in self.rules.items()
         ]
         items += self._skill_items(input.text)
-        notes = self._notes()
+        notes = self.log.notes(now.episode - 1, NOTES)
         items += [RecallItem(self._named(c), source=self._log_path(c.episode), priority=3.5) for c in notes]
         for key, score in self._searched(input.text, self.search if k is None else k):
-            chunk = self.log[key]
-            self.log[key] = chunk.recalled(score, input.text, now.episode)
+            chunk = self.log.recalled(key, score, input.text, now.episode)
             items.append(RecallItem(self._named(chunk), score, source=self._log_path(chunk.episode), priority=score))
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
-            items += [RecallItem(self._named(c), 1.0, priority=5.0 + c.step) for c in newest]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(self._named(c), count), 1.0, priority=5.0 + c.step) for c in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
         count = self.services.llm.count_tokens
         self._append(step_text(transition, self.state_tokens, count), transition.step)
         self._held_from = first_held(self.services, transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         if transition.terminated or transition.truncated:
             return
         if transition.step + 1 - self._since >= self.every:
@@ -306,7 +317,7 @@ class OpenClaw:
         least_score, least_recalls, least_queries = self.gate
         scored = [
             (dream_score(c, episode, self.half_life or 30.0), key)
-            for key, c in self.log.items()
+            for key, c in zip(self.log, self.log.values(), strict=True)
             if not c.promoted and c.recalls >= least_recalls and len(c.queries) >= least_queries
         ]
         best = sorted((s, key) for s, key in scored if s >= least_score)[::-1][: self.promoted]
@@ -325,35 +336,33 @@ class OpenClaw:
             return
         self._write_rules(rules)
         for _, key in best:
-            self.log[key] = replace(self.log[key], promoted=True)
+            self.log.promote(key)
         self._counts["promoted"] += len(best)
 
     def _append(self, text: str, step: int, *, note: bool = False) -> None:
-        key = self.services.new_id()
-        self.log[key] = Chunk(text, self.services.time().episode, step, note)
-        self._index(key)
-        while len(self.log) > self.max_log:
-            oldest = next(iter(self.log))
-            del self.log[oldest]
-            self._words.remove(oldest)
-            if self._vectors is not None:
-                self._vectors.remove(oldest)
+        self.log.append(self.services.new_id(), Chunk(text, self.services.time().episode, step, note))
 
     def _searched(self, query: str, k: int) -> list[tuple[int, float]]:
-        """Log entries that fit, and that the prompt does not show anyway, oldest first."""
+        """Log entries that fit, and that the prompt does not show anyway, oldest first.
+
+        At most a third of them: a search that gives nearly all there is has chosen nothing.
+        """
         now = self.services.time()
         snapshot = self.services.context.layout == "snapshot"
         first = max(0, now.step - self.recent) if snapshot else self._held_from
-        notes = self._notes()
+        notes = self.log.notes(now.episode - 1, NOTES)
         hidden = max(0, now.step - first) + len(notes)
-        hits = hybrid(self._vectors, self._words, query, k + hidden, diverse=self.diverse) if k else []
+        k = min(k, (len(self.log) - hidden + 2) // 3)
+        hits = self.log.search(query, k + hidden, diverse=self.diverse) if k > 0 else []
         hits = [(key, s * decay(now.episode - self.log[key].episode, self.half_life)) for key, s in hits]
+        hits = [hit for hit in hits if hit[1] >= self.least]
 
         def is_shown(chunk: Chunk) -> bool:
             here = chunk.episode == now.episode and chunk.step >= first and not chunk.note
             return here or any(chunk is note for note in notes)
 
-        return sorted(sorted((h for h in hits if not is_shown(self.log[h[0]])), key=lambda h: -h[1])[:k])
+        fresh = sorted((h for h in hits if not is_shown(self.log[h[0]])), key=lambda h: -h[1])
+        return sorted(distinct(fresh, lambda key: self.log[key].text)[:k])
 
     def _skill_items(self, query: str) -> list[RecallItem]:
         skills = list(self._all_skills().values())
@@ -380,24 +389,9 @@ class OpenClaw:
     def _rules_shown(self) -> str:
         return "\n".join(f"- {name}: {text}" for name, text in self.rules.items()) or "(none)"
 
-    def _notes(self) -> list[Chunk]:
-        """The newest notes of this episode and the one before: always shown."""
-        episode, found = self.services.time().episode, list[Chunk]()
-        for chunk in reversed(self.log.values()):
-            if chunk.episode < episode - 1 or len(found) == NOTES:
-                break
-            if chunk.note:
-                found.append(chunk)
-        return found[::-1]
-
     def _today(self) -> list[Chunk]:
         """The log of this episode."""
-        episode, found = self.services.time().episode, list[Chunk]()
-        for chunk in reversed(self.log.values()):
-            if chunk.episode != episode:
-                break
-            found.append(chunk)
-        return found[::-1]
+        return self.log.of(self.services.time().episode)
 
     def _named(self, chunk: Chunk) -> str:
         name = step_name(chunk.episode, chunk.step, self.services.time())
@@ -435,27 +429,14 @@ class OpenClaw:
     def snapshot(self) -> bytes:
         skills = [asdict(skill) for skill in self.skills.values()]
         here = [self._since, self._held_from, self._flushed, self._task]
-        return dump_state([rules_text(self.rules), skills, keyed(self.log), here, self._counts])
+        return dump_state([rules_text(self.rules), skills, self.log.state(), here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         rules, skills, log, here, self._counts = load_state(blob)
         self.rules = rules_of(rules)
         self.skills = {slug(s["name"]): Skill(**s) for s in skills}
-        self.log = {key: Chunk.load(row) for key, row in log}
+        self.log.load(log)
         self._since, self._held_from, self._flushed, self._task = here
-        self._build_indices()
-
-    def _build_indices(self) -> None:
-        embedder = self.services.embedder
-        self._words = Lexical()
-        self._vectors = VectorIndex(embedder) if embedder is not None else None
-        for key in self.log:
-            self._index(key)
-
-    def _index(self, key: int) -> None:
-        self._words.put(key, self.log[key].text)
-        if self._vectors is not None:
-            self._vectors.put(key, self.log[key].text)
 
 
 __all__: Sequence[str] = ["Edit", "OpenClaw", "Rule"]

@@ -72,7 +72,7 @@ class Chunk(Record):
     def load(cls, row: Sequence[Any]) -> Chunk:
         """What `row` gave."""
         *before, queries, episodes, promoted = row
-        return cls(*before, tuple(queries), tuple(episodes), promoted)
+        return replace(cls(*before), queries=tuple(queries), episodes=tuple(episodes), promoted=promoted)
 
 
 def hybrid(

@@ -110,26 +110,29 @@ class Entries:
     def __getitem__(self, id: int) -> Entry:
         return self._by_id[id]
 
-    def put(self, entry: Entry) -> None:
-        """Add a note, or replace the one with its id."""
+    def put(self, entry: Entry) -> list[Entry]:
+        """Add a note, or replace the one with its id; the notes that had to be forgotten for it."""
         self._set(entry)
         self._vectors.put(entry.id, entry.text)
         if self._words is not None:
             self._words.put(entry.id, _words_of(entry))
+        forgotten = []
         while len(self._by_id) > self.capacity:
-            self.remove(self._longest_ago())
-            self.evicted += 1
+            forgotten.append(self.remove(self._longest_ago()))
+        self.evicted += len(forgotten)
+        return [e for e in forgotten if e is not None]
 
-    def remove(self, id: int) -> None:
-        """Forget a note; one that is not there is ignored."""
+    def remove(self, id: int) -> Entry | None:
+        """Forget a note, and give it back; one that is not there is ignored."""
         entry = self._by_id.pop(id, None)
         if entry is None:
-            return
+            return None
         self._said(entry)
         del self._place[id]
         self._vectors.remove(id)
         if self._words is not None:
             self._words.remove(id)
+        return entry
 
     def confirm(self, text: str, time: Time) -> bool:
         """Whether a note says exactly `text`; it is then as new as `time`."""

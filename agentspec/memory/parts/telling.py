@@ -36,7 +36,7 @@ def course(steps: Sequence[Sequence[str]], tokens: int, count_tokens: CountToken
     """Steps in order within `tokens`, each a state and a line that says what was done and what came of it.
 
     The lines stay; the states share what they leave of the room in equal parts. Only where there is no room for the
-    lines is their end cut off.
+    lines is their end cut off. A state that reads as the one before it is not told again.
 
     Args:
         steps: pairs of state (may be empty) and line.
@@ -45,15 +45,16 @@ def course(steps: Sequence[Sequence[str]], tokens: int, count_tokens: CountToken
     left = tokens - sum(count_tokens(line) + 1 for line in lines)
     if left < 0:
         return clip_text("\n".join(lines), tokens, count_tokens)
-    shown: list[str] = []
+    shown, before = list[str](), ""
     waiting = sum(bool(state) for state, _ in steps)
     for state, line in steps:
         if state:
             part = excerpt(state, left // waiting - 1 - count_tokens("State: "), count_tokens)
             clipped = f"State: {part}" if part else ""
-            if count_tokens(clipped) >= MIN_CLIPPED or part == state:
+            if clipped != before and (count_tokens(clipped) >= MIN_CLIPPED or part == state):
                 shown.append(clipped)
                 left -= count_tokens(clipped) + 1
+                before = clipped
             waiting -= 1
         shown.append(line)
     return "\n".join(shown)

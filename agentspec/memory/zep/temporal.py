@@ -8,7 +8,7 @@ what contradicts them, so that the graph can be asked how things stood at any st
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from agentspec.memory.parts.entries import Entries, Entry
 from agentspec.protocols import Embedder
 from agentspec.retrieval import Graph, mmr, reciprocal_rank_fusion
 from agentspec.services import Time
+from agentspec.state import Json, joined
 
 _WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
 _ARTICLES = ("the", "a", "an")
@@ -34,9 +35,12 @@ class TemporalGraph:
     def __init__(self, embedder: Embedder, capacity: int) -> None:
         self.facts = Entries(embedder, capacity, words=True)
         self.names: dict[int, str] = {}
+        self.graph: Graph[int] = Graph()
         self._ids: dict[str, int] = {}  # normal name -> entity
         self._of: dict[int, dict[int, None]] = {}  # entity -> its facts
-        self.graph: Graph[int] = Graph()
+        self._called: dict[int, list[str]] = {}  # entity -> its normal names
+        self._numbered: dict[tuple[str, ...], dict[int, None]] = {}  # numbers in a name -> entities
+        self._written: dict[int, Json] = {}  # entities as a snapshot has them, until they change
 
     # -- entities --------------------------------------------------------------------------------------------------
 
@@ -47,20 +51,25 @@ class TemporalGraph:
     def add_entity(self, id: int, name: str) -> None:
         """Add an entity."""
         self.names[id] = name
-        self._ids[normal(name)] = id
-        self._of[id] = {}
+        self._numbered.setdefault(_numbers(name), {})[id] = None
+        self._of[id], self._called[id] = {}, []
         self.graph.add(id)
+        self.call(id, name)
 
     def call(self, id: int, name: str) -> None:
         """Another name of a known entity."""
-        self._ids.setdefault(normal(name), id)
+        known_as = normal(name)
+        if known_as not in self._ids:
+            self._ids[known_as] = id
+            self._called[id].append(known_as)
+            self._written.pop(id, None)
 
     def alike(self, name: str, k: int, least: float) -> list[int]:
         """Known entities that `name` may mean: near in meaning or sharing words, and with the same numbers in it.
 
         `restaurant 1` and `restaurant 2` are alike and never the same.
         """
-        others = [(id, known) for id, known in self.names.items() if _DIGITS.findall(known) == _DIGITS.findall(name)]
+        others = [(id, self.names[id]) for id in self._numbered.get(_numbers(name), ())]
         if not others:
             return []
         vectors = self.facts.embed([name, *(known for _, known in others)])
@@ -92,17 +101,17 @@ class TemporalGraph:
         subject, relation, target = triple
         data = {"triple": [subject, relation, target], "valid": valid, "invalid": None, "expired": None}
         entry = Entry(id, text, time, {**data, "mentions": [time.total]})
-        evicted = self.facts.evicted
-        self.facts.put(entry)
+        forgotten = self.facts.put(entry)
         self._link(entry)
-        if self.facts.evicted != evicted:
-            self._rebuild()
+        for old in forgotten:
+            self._unlink(old)
         return entry
 
     def remove_fact(self, id: int) -> None:
         """Forget a fact that says what another says."""
-        self.facts.remove(id)
-        self._rebuild()
+        fact = self.facts.remove(id)
+        if fact is not None:
+            self._unlink(fact)
 
     def mention(self, id: int, time: Time, most: int = 16) -> None:
         """A fact was told again."""
@@ -138,6 +147,8 @@ class TemporalGraph:
     ) -> list[tuple[Entry, float]]:
         """The best facts: by meaning, by words, and along the graph from what the query names.
 
+        What is over is ranked as everything else is: how things stood may be what is asked for.
+
         Args:
             least: smallest cosine similarity that counts.
             hops: how far along the graph.
@@ -147,16 +158,14 @@ class TemporalGraph:
         where = None if past else _open
         near = [(e.id, s) for e, s in self.facts.near(query, 2 * k, least=least, where=where)]
         words = [(e.id, s) for e, s in self.facts.by_words(query, 2 * k, where=where)]
-        start = self.named_in(query) or list(
-            dict.fromkeys(e for id, _ in [*near[:3], *words[:3]] for e in self._ends(id))
-        )
+        best = dict.fromkeys(id for id, _ in [*near[:3], *words[:3]])
+        start = self.named_in(query) or list(dict.fromkeys(e for id in best for e in self._ends(self.facts[id])))
         around = self._around(start, hops, 2 * k, where)
         fused = reciprocal_rank_fusion([near, words, around], constant=0.0)
         if rerank == "mentions":
             fused = sorted(fused, key=lambda pair: -len(self.facts[pair[0]].data["mentions"]))
         elif rerank == "mmr":
             fused = mmr(fused, self.facts.cosine, k)
-        fused.sort(key=lambda pair: not _open(self.facts[pair[0]]))  # what is over comes last
         return [(self.facts[id], score) for id, score in fused[:k]]
 
     def _around(self, start: list[int], hops: int, most: int, where: Any) -> list[tuple[int, float]]:
@@ -174,42 +183,59 @@ class TemporalGraph:
                 break
         return [(id, -float(far)) for id, far in list(facts.items())[:most]]
 
-    def _ends(self, id: int) -> tuple[int, int]:
-        subject, _, target = self.facts[id].data["triple"]
+    def _ends(self, fact: Entry) -> tuple[int, int]:
+        subject, _, target = fact.data["triple"]
         return subject, target
 
-    def _link(self, entry: Entry) -> None:
-        subject, target = self._ends(entry.id)
+    def _link(self, fact: Entry) -> None:
+        subject, target = self._ends(fact)
         for entity in (subject, target):
-            self._of[entity][entry.id] = None
+            self._of[entity][fact.id] = None
+            self._written.pop(entity, None)
         self.graph.connect(subject, target)
 
-    def _rebuild(self) -> None:
-        """Links anew, after facts have gone; entities without facts go, too."""
-        kept = dict.fromkeys(entity for e in self.facts for entity in self._ends(e.id))
-        self.names = {id: name for id, name in self.names.items() if id in kept}
-        self._ids = {name: id for name, id in self._ids.items() if id in kept}
-        self._of = {id: {} for id in self.names}
-        self.graph = Graph()
-        for id in self.names:
-            self.graph.add(id)
-        for entry in self.facts:
-            self._link(entry)
+    def _unlink(self, fact: Entry) -> None:
+        """Forget the links of a fact that has gone; entities without facts go, too."""
+        subject, target = self._ends(fact)
+        for entity in dict.fromkeys((subject, target)):
+            self._of[entity].pop(fact.id, None)
+            self._written.pop(entity, None)
+        if not self._of[subject].keys() & self._of[target].keys():
+            self.graph.disconnect(subject, target)
+        for entity in dict.fromkeys((subject, target)):
+            if not self._of[entity]:
+                self._forget(entity)
 
-    def state(self) -> list[Any]:
-        """JSON-like state."""
-        return [[[id, name] for id, name in self.names.items()], list(self._ids.items()), self.facts.state()]
+    def _forget(self, entity: int) -> None:
+        numbers = _numbers(self.names.pop(entity))
+        del self._numbered[numbers][entity], self._of[entity]
+        if not self._numbered[numbers]:
+            del self._numbered[numbers]
+        for name in self._called.pop(entity):
+            del self._ids[name]
+        self.graph.remove(entity)
+
+    def state(self) -> Json:
+        """State as JSON."""
+        for id, name in self.names.items():
+            if id not in self._written:
+                self._written[id] = Json.of([id, name, self._called[id], list(self.graph.neighbours(id))])
+        return joined([joined(self._written[id] for id in self.names), self.facts.state()])
 
     def load(self, state: list[Any]) -> None:
         """Return to `state`."""
-        names, ids, facts = state
-        self.names, self._ids = {id: name for id, name in names}, {name: id for name, id in ids}
+        entities, facts = state
+        self.names, self._ids, self._of, self._called, self._numbered, self._written = {}, {}, {}, {}, {}, {}
+        self.graph = Graph()
         self.facts.load(facts)
-        self._of, self.graph = {id: {} for id in self.names}, Graph()
-        for id in self.names:
-            self.graph.add(id)
-        for entry in self.facts:
-            self._link(entry)
+        for id, name, called, _ in entities:
+            self.names[id], self._of[id], self._called[id] = name, {}, called
+            self._numbered.setdefault(_numbers(name), {})[id] = None
+            self._ids |= dict.fromkeys(called, id)
+        self.graph.load([[id, [[other, 1.0] for other in near]] for id, _, _, near in entities])
+        for fact in self.facts:
+            for entity in self._ends(fact):
+                self._of[entity][fact.id] = None
 
 
 def normal(name: str) -> str:
@@ -222,6 +248,10 @@ def normal(name: str) -> str:
     return " ".join([word for word in words if word not in _ARTICLES] or words)
 
 
+def _numbers(name: str) -> tuple[str, ...]:
+    return tuple(_DIGITS.findall(name))
+
+
 def holds(fact: Entry, step: int) -> bool:
     """Whether a fact is so at a step of the run."""
     invalid = fact.data["invalid"]
@@ -230,3 +260,12 @@ def holds(fact: Entry, step: int) -> bool:
 
 def _open(fact: Entry) -> bool:
     return fact.data["invalid"] is None
+
+
+def fields_of(state: Mapping[str, Any], subject: str, deep: int = 3) -> Iterator[tuple[str, str, str]]:
+    """The fields of a structured state: whose, which, and their value, where that is short."""
+    for key, value in state.items():
+        if isinstance(value, Mapping) and deep:
+            yield from fields_of(value, str(key), deep - 1)
+        elif isinstance(value, str | int | float | bool) and len(str(value)) <= 60:
+            yield subject, str(key), str(value)

@@ -1,4 +1,4 @@
-"""What differs between the versions of ai2thor that households need: starting, resetting, stepping, and what goes wrong.
+"""What differs between the versions of ai2thor that households need: starting, stepping, and what goes wrong.
 
 ALFRED's trials were recorded with 2.1.0, RoboTHOR is played with 5.0.0. Both install a package called `ai2thor`, so an
 environment holds one of them; each has an extra of its own. Neither package holds the simulator itself: a *build* is
@@ -253,13 +253,17 @@ class RoboThorLink:
 
     def _wake(self, server: Any) -> None:
         """End the wait for a player that has ended: an empty message through its pipe."""
-        if not self._stopping:
+        for _ in range(round(START_SECONDS / 0.2)):
+            if self._stopping:
+                return
             try:
                 pipe = os.open(server.server_pipe_path, os.O_WRONLY | os.O_NONBLOCK)
             except OSError:
-                return  # nobody waits
+                time.sleep(0.2)  # nobody has opened it to wait yet
+                continue
             os.write(pipe, server.eom_header)
             os.close(pipe)
+            return
 
     def step(self, action: dict[str, Any]) -> Any:
         """One action; a teleport gets the fields that 5.0.0 asks for."""
@@ -277,7 +281,7 @@ class RoboThorLink:
             }
         try:
             return self._controller.step(action)
-        except (RuntimeError, TimeoutError) as error:
+        except (RuntimeError, OSError) as error:  # a timeout is an OSError
             raise NoSimulator(f"the player of ai2thor {self.version} has ended ({error})") from error
 
     def stop(self) -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import math
+import weakref
 from collections.abc import Mapping
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +22,7 @@ from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Cell, cell_at
 from agentspec.envs.thor.simulator.links import LINKS, Link
 from agentspec.envs.thor.simulator.mirror import complete, mirror
-from agentspec.envs.thor.standin.launch import write_executable
+from agentspec.envs.thor.standin.launch import Script, write_executable
 
 STANDIN = "standin"
 """As `executable`: the offline world behind ai2thor's protocol."""
@@ -50,12 +52,11 @@ class Ai2Thor:
         folders: Mapping[str, str] | None = None,
     ) -> None:
         self.settings = settings
-        self._script = None
-        if executable == STANDIN:
-            self._script = write_executable(folders or {})
-            executable = self._script.path
-        self._link: Link = LINKS[version](settings, executable, pictures, needs_display=self._script is None)
-        self._pictures = pictures
+        self._made_of = (version, settings, executable, pictures, dict(folders or {}))
+        script = write_executable(folders or {}) if executable == STANDIN else None
+        program = script.path if script else executable
+        self._link: Link = LINKS[version](settings, program, pictures, needs_display=script is None)
+        self._end = weakref.finalize(self, _end, self._link, script)
         self.scene = ""
         self._history: list[dict[str, Any]] = []
         self._event: Event | None = None
@@ -88,7 +89,7 @@ class Ai2Thor:
         if not told["lastActionSuccess"] and not told.get("errorMessage"):
             told["errorMessage"] = f"the simulator refused {name}"
         frame = None if raw.frame is None else np.ascontiguousarray(raw.frame, dtype=np.uint8)
-        self._event = Event(told, None if frame is None else lambda: frame)
+        self._event = Event(told, None if frame is None else partial(np.asarray, frame))
         self._boxes = None
         return self._event
 
@@ -141,6 +142,24 @@ class Ai2Thor:
 
     def close(self) -> None:
         """End the simulator."""
-        self._link.stop()
-        if self._script is not None:
-            self._script.remove()
+        self._end()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is another simulator, brought to the same place."""
+        return _again, (self._made_of, self.scene, list(self._history))
+
+
+def _again(made_of: tuple[Any, ...], scene: str, history: list[dict[str, Any]]) -> Ai2Thor:
+    version, settings, executable, pictures, folders = made_of
+    player = Ai2Thor(version, settings, executable=executable, pictures=pictures, folders=folders)
+    if scene:
+        player.begin(scene)
+    for action in history:
+        player.step(action)
+    return player
+
+
+def _end(link: Link, script: Script | None) -> None:
+    link.stop()
+    if script is not None:
+        script.remove()

@@ -33,7 +33,9 @@ class Scenes:
 
     def names(self) -> list[str]:
         """As ai2thor lists them."""
-        recorded = {p.name.split(".")[0] for p in Path(self.objects).glob("FloorPlan*.json*")} if self.objects else set()
+        recorded = (
+            {p.name.split(".")[0] for p in Path(self.objects).glob("FloorPlan*.json*")} if self.objects else set()
+        )
         homesteads = [f"{n}{SUFFIX}" if n.removeprefix("FloorPlan").isdigit() else n for n in recorded]
         return sorted([*homes.ROOMS, homes.apartment().name, *homesteads])
 

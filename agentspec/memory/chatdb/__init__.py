@@ -18,27 +18,22 @@ placeholders, all before the decision; `template` none.
 from __future__ import annotations
 
 import re
-import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import FEEDBACK_TOKENS, first_held, step_name
+from agentspec.memory.chatdb.database import TABLES, Database, plain
+from agentspec.memory.parts.steps import FEEDBACK_TOKENS, IN, brief, first_held, goal_of, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
-from agentspec.retrieval import Lexical
-from agentspec.state import Json, dump_state, joined, load_state
+from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text, excerpt
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
 PRESETS: dict[str, dict[str, Any]] = {"paper": {"mode": "chain"}, "rl": {"mode": "template"}}
-TABLES = """CREATE TABLE steps (id INTEGER PRIMARY KEY, episode INTEGER, step INTEGER, place TEXT, state TEXT,
-  action TEXT, args TEXT, ok INTEGER, feedback TEXT, reward REAL);
-CREATE TABLE notes (id INTEGER PRIMARY KEY, note TEXT);"""
-COLUMNS = 10
 PLACES = ("place", "location", "room", "position", "agent_position")
 """Fields of an observation's state that say where the agent is, the first one that is there."""
 
@@ -57,30 +52,7 @@ FILL = (
     "\n\nResults so far:\n{results}\n\nNext step: {about}\nSQL: {sql}\nWrite this statement with every <placeholder> "
     'replaced by what the results say. Answer with JSON:\n{{"sql": the statement}}'
 )
-TASK_TOKENS = 64
 PLACEHOLDER = re.compile(r"<[A-Za-z_][\w .-]*>")
-LONGEST = 100_000  # bytes of a value or row: no statement can make a note of megabytes
-MACHINE_STEPS = 1000  # SQLite instructions between two looks at the limit
-FUNCTIONS = frozenset(
-    (
-        *(
-            "abs",
-            "avg",
-            "coalesce",
-            "count",
-            "glob",
-            "group_concat",
-            "ifnull",
-            "iif",
-            "instr",
-            "length",
-            "like",
-            "lower",
-        ),
-        *("ltrim", "max", "min", "nullif", "replace", "round", "rtrim", "substr", "substring", "sum", "total", "trim"),
-        *("upper", "row_number", "rank", "dense_rank", "lag", "lead", "first_value", "last_value"),
-    )
-)
 
 
 @dataclass(frozen=True)
@@ -89,112 +61,6 @@ class SQLStep:
 
     about: str
     sql: str
-
-
-class Database:
-    """Steps and notes in SQLite, and safe ways to ask for them.
-
-    Args:
-        instructions: most instructions of SQLite's machine for one statement that a model wrote.
-    """
-
-    def __init__(self, instructions: int = 1_000_000) -> None:
-        self.instructions = instructions
-        self._db = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
-        self._db.executescript(TABLES)
-        self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
-        self._words = Lexical()
-        self._rows: dict[int, Json] = {}  # the rows of `steps`, which nobody changes, as a snapshot has them
-
-    def add(self, row: Sequence[Any]) -> None:
-        """Insert a row of `steps`; without an id it gets the one after the highest."""
-        values = tuple(row)
-        cursor = self._db.execute(f"INSERT INTO steps VALUES ({','.join('?' * COLUMNS)})", values)
-        id = int(cursor.lastrowid or 0)
-        self._words.put(id, " ".join(v for v in values[3:] if isinstance(v, str)))
-        self._rows[id] = Json.of([id, *values[1:]])
-
-    def trim(self, steps: int, notes: int) -> int:
-        """Keep the newest rows of each table; how many went."""
-        newest = "id NOT IN (SELECT id FROM steps ORDER BY id DESC LIMIT ?)"
-        for (old,) in self.rows(f"SELECT id FROM steps WHERE {newest}", (steps,)):  # a constant
-            self._words.remove(old)
-            del self._rows[old]
-        gone = self._db.execute(f"DELETE FROM steps WHERE {newest}", (steps,)).rowcount
-        newest = newest.replace("steps", "notes")
-        return gone + self._db.execute(f"DELETE FROM notes WHERE {newest}", (notes,)).rowcount
-
-    def like(self, text: str, most: int) -> list[int]:
-        """Ids of the steps that share words with a text, by BM25, best first."""
-        return [key for key, _ in self._words.search(text, most)]
-
-    def rows(self, sql: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """The rows of one of our own queries."""
-        return self._db.execute(sql, tuple(values)).fetchall()
-
-    def run(self, sql: str, limit: int) -> str:
-        """What a statement that a model wrote gives, as text: rows, `done`, or `error: ...`; it never raises."""
-        budget = [self.instructions // MACHINE_STEPS]
-
-        def spend() -> int:
-            budget[0] -= 1
-            return int(budget[0] < 0)
-
-        self._db.set_authorizer(_authorize)
-        self._db.set_progress_handler(spend, MACHINE_STEPS)
-        try:
-            cursor = self._db.execute(sql)
-            if cursor.description is None:
-                return f"done ({max(0, cursor.rowcount)} rows)"
-            names = [column[0] for column in cursor.description]
-            found = cursor.fetchmany(limit + 1)
-            cursor.close()
-        except (sqlite3.Error, sqlite3.Warning, ValueError, OverflowError, MemoryError) as error:
-            return "error: stopped, it takes too long" if budget[0] < 0 else f"error: {error}"
-        finally:
-            self._db.set_progress_handler(None, 0)
-            self._db.set_authorizer(None)
-        return table(names, found[:limit]) + ("\n(more rows are left out)" if len(found) > limit else "")
-
-    def state(self) -> Json:
-        """State as JSON: the rows of both tables."""
-        notes = self.rows("SELECT id, note FROM notes ORDER BY id")
-        return joined([joined(self._rows.values()), [[i, _plain(note)] for i, note in notes]])
-
-    def load(self, state: Sequence[Any]) -> None:
-        """Return to `state`."""
-        self._words, self._rows = Lexical(), {}
-        self._db.execute("DELETE FROM steps")
-        self._db.execute("DELETE FROM notes")
-        for row in state[0]:
-            self.add(row)
-        self._db.executemany("INSERT INTO notes VALUES (?, ?)", state[1])
-
-
-def _plain(value: Any) -> Any:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-
-
-def _authorize(action: int, first: str | None, second: str | None, database: str | None, source: str | None) -> int:
-    """What a model's statement may do: read both tables, write notes, call harmless functions; nothing else."""
-    if action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_RECURSIVE):
-        return sqlite3.SQLITE_OK
-    if action == sqlite3.SQLITE_READ and first in ("steps", "notes"):
-        return sqlite3.SQLITE_OK
-    if action == sqlite3.SQLITE_READ and not second and database is None:  # count(*) of a WITH clause
-        return sqlite3.SQLITE_DENY if (first or "").casefold().startswith(("sqlite_", "pragma_")) else sqlite3.SQLITE_OK
-    if action in (sqlite3.SQLITE_INSERT, sqlite3.SQLITE_UPDATE, sqlite3.SQLITE_DELETE) and first == "notes":
-        return sqlite3.SQLITE_OK
-    if action == sqlite3.SQLITE_FUNCTION and (second or "").casefold() in FUNCTIONS:
-        return sqlite3.SQLITE_OK
-    return sqlite3.SQLITE_DENY
-
-
-def table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Rows as text, one per line, with the columns' names."""
-    if not rows:
-        return "no rows"
-    return "\n".join(", ".join(f"{n}: {_plain(v)}" for n, v in zip(names, row, strict=True)) for row in rows)
 
 
 class ChatDB:
@@ -267,7 +133,8 @@ class ChatDB:
             now = self.services.time()
             newest = "WHERE episode = ? AND step >= ? ORDER BY id"
             rows = self._lines(newest, (now.episode, max(0, now.step - self.recent)))
-            items += [RecallItem(line, priority=3.0 + i) for i, (_, line) in enumerate(rows)]
+            count = self.services.llm.count_tokens
+            items += [RecallItem(brief(line, count), priority=3.0 + i) for i, (_, line) in enumerate(rows)]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:
@@ -327,7 +194,7 @@ class ChatDB:
         return PLAN.format(
             most=self.most_steps,
             rows=self.row_limit,
-            task=clip_text(input.instruction, TASK_TOKENS, count),
+            task=goal_of(input.instruction, count),
             rows_now=self.db.rows("SELECT count(*) FROM steps")[0][0],
             episode=newest[0],
             step=newest[1],
@@ -342,15 +209,16 @@ class ChatDB:
         first = max(0, now.step - self.recent) if snapshot else self._held_from
         hidden = max(0, now.step - first)
         alike = self.db.like(input.text, 3 * limit + hidden)
-        # Of steps that failed alike the newest stands for all.
-        failures = "id IN (SELECT max(id) FROM steps WHERE ok = 0 GROUP BY action, args, feedback)"
+        # Of steps that went alike the newest stands for all.
+        newest = "id IN (SELECT max(id) FROM steps WHERE {} GROUP BY action, args, feedback)"
+        failures = newest.format("ok = 0")
         alike_ids = f"(ok = 1 OR {failures}) AND id IN ({','.join(map(str, alike)) or 'NULL'})"
         shown: set[int] = set()
         found: list[tuple[str, str]] = []
         for about, where, order, values in (
             ("Failed before", failures, "id DESC", ()),
-            ("Best rewards", "reward > 0", "reward DESC, id DESC", ()),
-            ("Worst rewards", "reward < 0", "reward, id DESC", ()),
+            ("Best rewards", newest.format("reward > 0"), "reward DESC, id DESC", ()),
+            ("Worst rewards", newest.format("reward < 0"), "reward, id DESC", ()),
             ("At this place before", "place <> '' AND place = ?", "id DESC", (place_of(input.state),)),
             ("Like now", alike_ids, "id", ()),
         ):
@@ -373,17 +241,17 @@ class ChatDB:
     def _line(
         self, episode: int, step: int, action: str, args: str, ok: int, feedback: str, reward: float, state: str
     ) -> str:
-        seen = excerpt(state, self.state_tokens // 2, self.services.llm.count_tokens)
+        seen = excerpt(state, self.state_tokens // 4, self.services.llm.count_tokens)
         told = f"{action}({args})" if action.isidentifier() else action
         paid = f" ({reward:+.2f})" if reward else ""
         name = step_name(episode, step, self.services.time())
-        return f"{name}: {told} {'->' if ok else 'failed:'} {feedback}{paid} | in: {seen}"
+        return f"{name}: {told} {'->' if ok else 'failed:'} {feedback}{paid}{IN}{seen}"
 
     def describe(self) -> str:
         """All rows as text."""
         steps = self._lines("ORDER BY id", ())
         notes = self.db.rows("SELECT note FROM notes ORDER BY id")
-        return "\n".join(["steps", *(line for _, line in steps), "notes", *(f"- {_plain(n)}" for (n,) in notes)])
+        return "\n".join(["steps", *(line for _, line in steps), "notes", *(f"- {plain(n)}" for (n,) in notes)])
 
     def metrics(self) -> Mapping[str, Any]:
         """Rows and notes there are; statements of the model, how many of them failed, and rows dropped, so far."""
