@@ -26,7 +26,7 @@ from agentspec.llm.base import Message, assistant, user
 from agentspec.reading import Reading, read
 from agentspec.registry import SpecError
 from agentspec.services import Services
-from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, RecallItem, Sampled
+from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, Sampled
 from agentspec.visible import visible
 
 MENU_ANSWER = "Answer with one of the listed actions, word for word."
@@ -35,6 +35,8 @@ ON_REQUEST = "What you are asked to write stands at the end of each message; wri
 AGAIN = "No action could be read from this answer: {problem}. {how}"
 TRANSCRIPT = "Transcript so far:\n{text}\n\n"
 MAX_RETRIES = 2
+STEPS = ("step", "failure")
+"""Kinds of recalled items that do nothing but tell one of the newest steps."""
 
 _INVENTED = re.compile(r"^\W{0,4}(?:observation|user|human|environment|action)\b", re.IGNORECASE | re.MULTILINE)
 
@@ -63,16 +65,33 @@ def render_actions(schema: ActionSchema) -> str:
 def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "") -> str:
     """Lessons and memory within the spec's budgets, a method's own transcript of the steps, then the observation.
 
-    Steps that the transcript tells are not told again by a memory: `base`, or items of kind `step`.
+    Steps that the transcript or the conversation tells are not told again by a memory (items of kind `step` and
+    `failure`, one for each of the newest steps); of a conversation's, failures stay whose reason it does not give.
     """
     if transcript:
-        recall = Recall(tuple(item for item in recall.items if not _a_step(item)))
+        recall = Recall(tuple(item for item in recall.items if item.kind not in STEPS))
         transcript = TRANSCRIPT.format(text=transcript)
+    elif services.context.told:
+        recall = _untold(recall, services, input.text)
     return services.context.recalled(recall) + transcript + input.text
 
 
-def _a_step(item: RecallItem) -> bool:
-    return item.kind == "step" or (item.kind == "episodic" and item.source == "memory.base")
+def _untold(recall: Recall, services: Services, observation: str) -> Recall:
+    """`recall` without the newest steps that the conversation holds."""
+    context = services.context
+    steps = [i for i, item in enumerate(recall.items) if item.kind in STEPS]
+    said = [observation, *(message.text for message in context.messages)]
+    told = {
+        i
+        for i in steps[-context.told :]
+        if recall.items[i].kind == "step" or any(_reason(recall.items[i].text) in text for text in said)
+    }
+    return Recall(tuple(item for i, item in enumerate(recall.items) if i not in told))
+
+
+def _reason(line: str) -> str:
+    """Why a step failed, from the line that tells it: `3. JUMP() -> there is no such action`."""
+    return line.partition(" -> ")[2].partition("\n")[0]
 
 
 def default_answer(schema: ActionSchema) -> str:

@@ -88,9 +88,12 @@ class Values:
     def bare(self, text: str) -> Action | ActionError | None:
         """A name without brackets, its arguments perhaps on a line of their own."""
         match = WORD.match(text)
-        name = known_name(match.group(), self.schema) if match else None
-        if match is None or name is None or (self.schema.choices and not match.group().isupper()):
-            return None  # beside a menu only capitals are a name: "wait" is an entry, or a word
+        word = match.group() if match else ""
+        # Beside a menu "wait" is an entry, or a word, and no name.
+        named = not self.schema.choices or word.isupper() or "_" in word
+        name = known_name(word, self.schema) if named else None
+        if match is None or name is None:
+            return None
         given = INPUT.search(text, match.end())
         if given is not None and not text[match.end() : given.start()].strip(" \t\n*_`\"'.,"):
             value = (

@@ -53,7 +53,7 @@ class Diary(BaseMemory):
     """A memory that tells its steps whatever the conversation holds."""
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        return Recall(tuple(RecallItem(line, source="memory.diary") for _, line, _ in self._steps))
+        return Recall(tuple(RecallItem(line, source="memory.diary") for line, _ in self._steps))
 
 
 @pytest.fixture

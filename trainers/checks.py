@@ -11,15 +11,13 @@ import math
 from collections.abc import Collection, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
-from trl import GRPOConfig
-
 from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS
 from trainers.estimators import ESTIMATORS
-from trainers.fields import field_rules
+from trainers.fields import REFUSED
 from trainers.losses import LOSSES, loss
 from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.unread import REFLECTION, unread_with_a_value
@@ -76,10 +74,10 @@ def check_given(names: Iterable[str], where: str) -> None:
         names: keys of a YAML file, or options of a command line.
         where: what they were read from, for the message.
     """
-    rules = field_rules(GRPOConfig)
+    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
     for name in names:
-        if name in rules and rules[name].status == "refused":
-            raise SpecError(f"{where}: `{name}` is not read: {rules[name].why}")
+        if name in why:
+            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:

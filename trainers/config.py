@@ -6,16 +6,16 @@ each field. What cannot work or would not be exact is refused at start (`trainer
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from typing import Any
 
 from trl import GRPOConfig
 
 from agentspec.carry import start_bank
-from agentspec.registry import SpecError
+from agentspec.llm.models import base_of
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
+from trainers.ahead import check_world, structure
 from trainers.checks import check
 from trainers.credit import CreditRule
 from trainers.sequences import TrainFilter
@@ -133,12 +133,7 @@ class ScaffoldConfig(GRPOConfig):
 
     def __post_init__(self) -> None:
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
-            value = getattr(self, name)
-            if isinstance(value, str) and value.lstrip()[:1] in ("{", "["):
-                try:
-                    setattr(self, name, json.loads(value))
-                except ValueError as error:
-                    raise SpecError(f'{name}: not valid JSON ({error}); quote keys and strings with "') from error
+            setattr(self, name, structure(getattr(self, name)))
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -151,7 +146,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def spec(self) -> AgentSpec:
         """The training scaffold."""
-        return agent_spec(self.agent)
+        return agent_spec(self.agent).with_base(base_of(self.model))
 
     @property
     def credit_rule(self) -> CreditRule:
@@ -168,13 +163,9 @@ class ScaffoldConfig(GRPOConfig):
         """Name and options of the environment.
 
         Raises:
-            SpecError: not of the form `{name: ..., options: {...}}`.
+            SpecError: not of the form `{name: ..., options: {...}}`, an unknown name or option.
         """
-        value = self.environment or "deliverybench"
-        given: dict[str, Any] = {"name": value} if isinstance(value, str) else value
-        if not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
-            raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")
-        return given["name"], dict(given.get("options") or {})
+        return check_world(self.environment or "deliverybench")
 
     @property
     def validates(self) -> bool:
@@ -189,7 +180,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def other_specs(self) -> list[AgentSpec]:
         """Agent specs to validate under, beside the training scaffold."""
-        return [agent_spec(s) for s in _listed(self.validation_specs or [])]
+        return [agent_spec(s).with_base(base_of(self.model)) for s in _listed(self.validation_specs or [])]
 
     @property
     def evaluation_sampling(self) -> dict[str, Any]:

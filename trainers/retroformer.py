@@ -70,14 +70,7 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
 
 
 class RetroformerTrainer(ScaffoldGRPOTrainer):
-    """GRPO for the reflector of a frozen actor.
-
-    Args:
-        model: a PEFT model as of `trainers.policy.load_actor_and_reflector`.
-        args: as of `as_retroformer`.
-        make_llm: model, tokenizer -> a backend that gives each call its adapter.
-        kwargs: as of `trainers.grpo.ScaffoldGRPOTrainer`.
-    """
+    """GRPO for the reflector of a frozen actor: `model` of `load_actor_and_reflector`, `args` of `as_retroformer`."""
 
     def __init__(
         self,

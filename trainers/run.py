@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -46,8 +45,6 @@ def train(
         SpecError: the configuration cannot work, or another run is writing into its folder.
         KeyboardInterrupt: after a line that says how to go on.
     """
-    # Deprecations between libraries: nothing that whoever trains could change.
-    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(transformers|trl|peft|accelerate|datasets)\b")
     config.check()
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None

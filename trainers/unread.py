@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from trl import GRPOConfig
-
 from trainers.estimators import ESTIMATORS, estimator
 from trainers.fields import defaults, field_rules
 from trainers.losses import loss
@@ -26,6 +24,8 @@ COLOCATED = (
 
 def unread_with_a_value(config: ScaffoldConfig) -> Iterator[str]:
     """What is set and not read, with what to set instead."""
+    from trl import GRPOConfig
+
     for name, rule in field_rules(GRPOConfig).items():
         value = getattr(config, name, rule.allowed[0] if rule.allowed else None)
         if rule.status != "used" and value not in rule.allowed:

@@ -20,8 +20,8 @@ def describe(transition: Transition) -> str:
 class BaseMemory:
     """The last `window` steps of the episode as text: action, outcome, and what was seen.
 
-    In a conversation nothing is told twice: of the steps that it still holds only failures stand here whose reason no
-    observation gave.
+    In a conversation nothing is told twice (`agentspec.prompting`): of the steps that it still holds only failures are
+    shown whose reason no observation gave.
 
     Args:
         window: steps kept.
@@ -38,23 +38,16 @@ class BaseMemory:
             raise ValueError(f"memory base: window must be at least 1, got {window}")
         self.services = services
         self.observation_tokens = observation_tokens
-        self._steps: deque[tuple[int, str, str]] = deque(maxlen=window)
-        """Number of a step, what is told of it, and why it failed (empty: it did not)."""
+        self._steps: deque[tuple[str, str]] = deque(maxlen=window)
+        """What is told of a step, and as which kind of thing: a `step`, or a `failure`."""
 
     def begin_episode(self, task: Task) -> None:
         self._steps.clear()
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        context = self.services.context
-        told = self.services.clock.step - context.told
-        said = [input.text, *(m.text for m in context.messages)] if context.told else []
-        lines = [
-            line
-            for step, line, failure in self._steps
-            if step < told or (failure and not any(failure in text for text in said))
-        ]
-        lines = lines[-k:] if k else lines
-        return Recall(tuple(RecallItem(line, source="memory.base", priority=i) for i, line in enumerate(lines)))
+        steps = list(self._steps)[-k:] if k else self._steps
+        items = [RecallItem(line, 0.0, kind, "memory.base", i) for i, (line, kind) in enumerate(steps)]
+        return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
@@ -62,7 +55,7 @@ class BaseMemory:
         if self.observation_tokens and self.services.context.layout == "snapshot":
             count = self.services.llm.count_tokens
             line += f"\n   seen: {excerpt(transition.input.text, self.observation_tokens, count)}"
-        self._steps.append((transition.step, line, "" if seen.ok else seen.feedback))
+        self._steps.append((line, "step" if seen.ok else "failure"))
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         return None
@@ -71,5 +64,4 @@ class BaseMemory:
         return dump_state([list(step) for step in self._steps])
 
     def restore(self, blob: bytes) -> None:
-        steps = load_state(blob)
-        self._steps = deque(((number, line, failure) for number, line, failure in steps), maxlen=self._steps.maxlen)
+        self._steps = deque(((line, kind) for line, kind in load_state(blob)), maxlen=self._steps.maxlen)

@@ -48,8 +48,8 @@ def test_the_state_is_restored_with_what_is_told_of_it() -> None:
     from agentspec.llm.recorder import Recorder
 
     agent = AgentSpec.from_data({"memory": "base"}).build(Recorder(ScriptedLLM(["x"]), episode="e", seed=0))
-    agent.memory._steps.append((0, "1. A() -> no (+1.00)", "no"))
+    agent.memory._steps.append(("1. A() -> no (+1.00)", "failure"))
     blob = agent.memory.snapshot()
     agent.memory.begin_episode(Task(TOY, 0))
     agent.memory.restore(blob)
-    assert list(agent.memory._steps) == [(0, "1. A() -> no (+1.00)", "no")] and agent.memory.snapshot() == blob
+    assert list(agent.memory._steps) == [("1. A() -> no (+1.00)", "failure")] and agent.memory.snapshot() == blob

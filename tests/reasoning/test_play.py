@@ -48,7 +48,7 @@ def test_no_prompt_changes_unseen() -> None:
 
 def test_the_order_of_a_prompt_is_the_declared_one() -> None:
     page = (DOCS / "prompts" / "reflexion.md").read_text(encoding="utf-8")
-    prompt = page.split("````text")[1].split("````")[0]
+    prompt = page.split("layout `snapshot`")[1].split("````text")[1].split("````")[0]
     marks = [
         "--- system ---",
         "You are a delivery courier",

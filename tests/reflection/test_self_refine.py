@@ -149,7 +149,8 @@ def test_the_critic_sees_reasons_conversation_and_memory() -> None:
             return "Verdict: keep"
         return f"Thought: reason-{request.tag.step}\nAction: SUB()"
 
-    agent = {"reasoning": "react", "memory": "base", **{k: v for k, v in spec().items() if k != "reasoning"}}
+    memory = "tests.test_seams:Diary"  # one that repeats what the conversation holds
+    agent = {"reasoning": "react", "memory": memory, **{k: v for k, v in spec().items() if k != "reasoning"}}
     _, requests = play(script, agent)
     critic = [r for r in requests if r.tag.purpose == "feedback"][-1]
     assert "Its reasons:" in last(critic) and "reason-2" in last(critic)  # of the action under judgement
