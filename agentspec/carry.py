@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 FORMAT = 1
 FILE = "memory.json"
 KIND = "agentspec memory"
+BROKEN = "a memory file with broken content"
+GROW = "was it edited, or written by another version? grow the memory again"
 
 Carry = Literal["first", "best"]
 """Whose memory a task carries on: that of its first rollout, or of the one with the highest reward."""
@@ -105,18 +107,38 @@ class MemoryBank:
         """
         try:
             data = json.loads(blob)
-            if data["kind"] != KIND:
-                raise KeyError("kind")
-        except (ValueError, KeyError, TypeError) as error:
+        except ValueError:
+            data = None
+        if not isinstance(data, dict) or data.get("kind") != KIND:
             raise ValueError(
-                f"not a memory file ({type(error).__name__}: {error}); give one that a run wrote"
-            ) from error
+                f"not a memory file; give the {FILE} of a training run, or the .{FILE} beside a file that "
+                "`agentspec run --out` wrote for an agent with `scope: run`"
+            )
         if data["format"] != FORMAT:
             raise ValueError(
                 f"a memory file of format {data['format']}, this version reads {FORMAT}; grow the memory again"
             )
-        modules = data["modules"]["memory"], data["modules"]["reflection"]
-        return cls(modules, dict(data["states"]), str(data["latest"]), str(data["start"]))
+        try:
+            modules = str(data["modules"]["memory"]), str(data["modules"]["reflection"])
+            states: dict[str, str] = dict(data["states"])
+            if not all(isinstance(state, str) for state in states.values()):
+                raise TypeError("a state that is no text")
+            return cls(modules, states, str(data["latest"]), str(data["start"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{BROKEN} ({type(error).__name__}: {error}); {GROW}") from error
+
+    def check(self) -> None:
+        """Look into every state, as far as it can be told without its modules.
+
+        Raises:
+            ValueError: one of them is not what an agent carries.
+        """
+        for state in (*self.states.values(), *([self.start] if self.start else [])):
+            try:
+                time, _, _ = (json.loads(state)[part] for part in ("time", "memory", "reflection"))
+                _ = {name: time[name] for name in ("episode", "before", "ids")}
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{BROKEN} ({type(error).__name__}: {error}); {GROW}") from error
 
 
 def start_bank(source: str | Path, spec: AgentSpec) -> MemoryBank:
@@ -131,26 +153,37 @@ def start_bank(source: str | Path, spec: AgentSpec) -> MemoryBank:
     """
     if not source:
         return MemoryBank.of_spec(spec)
-    path = Path(source)
-    path = path / FILE if path.is_dir() else path
-    if not path.is_file():
-        raise SpecError(f"start_memory: there is no {path}; give a memory file, or the folder of a run that wrote one")
+    bank = read_bank(source, "start_memory: ")
     if spec.scope != "run":
         raise SpecError(
             f"start_memory {str(source)!r}: the agent ({spec.label}) has `scope: {spec.scope}`, so every episode "
             "starts empty; set `scope: run`"
         )
-    try:
-        bank = MemoryBank.load(path.read_bytes())
-    except ValueError as error:
-        raise SpecError(f"start_memory {path}: {error}") from error
     wanted = MemoryBank.of_spec(spec).modules
     if bank.modules != wanted:
         raise SpecError(
-            f"start_memory {path} holds the state of memory and reflection {bank.modules}, the agent has {wanted}; "
+            f"start_memory {source} holds the state of memory and reflection {bank.modules}, the agent has {wanted}; "
             "give the agent the same modules"
         )
     return bank.as_start()
+
+
+def read_bank(source: str | Path, what: str = "") -> MemoryBank:
+    """The bank of a memory file, or of a run folder that holds one; `what` begins the messages.
+
+    Raises:
+        SpecError: there is no such file, or it is no memory file.
+    """
+    path = Path(source)
+    path = path / FILE if path.is_dir() else path
+    if not path.is_file():
+        raise SpecError(f"{what}there is no {path}; give a memory file, or the folder of a run that wrote one")
+    try:
+        bank = MemoryBank.load(path.read_bytes())
+        bank.check()
+    except ValueError as error:
+        raise SpecError(f"{what}{path}: {error}") from error
+    return bank
 
 
 def save_bank(path: str | Path, bank: MemoryBank) -> None:

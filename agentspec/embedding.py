@@ -38,6 +38,9 @@ NAMES = ("minilm", "hash")
 CACHED_TEXTS = 200_000
 """Most vectors an embedder keeps per process; the one used longest ago goes first (384 floats: 1.5 kB each)."""
 
+LARGEST_DIM = 1 << 16
+"""Most buckets of the `hash` embedder: more would cost memory and tell no more words apart."""
+
 _WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
 
 
@@ -220,7 +223,7 @@ def _settings(spec: str | Mapping[str, Any]) -> dict[str, Any]:
         "hash": {"dim": int},
         "endpoint": {"endpoint": str, "model": str, "api_key_env": str, "timeout_s": (int, float)},
     }
-    if kind not in known:
+    if not isinstance(kind, str) or kind not in known:
         raise SpecError(
             f"unknown embedder {spec!r}{suggest(str(kind), NAMES)}; expected one of {', '.join(NAMES)}, or "
             "{endpoint: URL, model: NAME}"
@@ -236,6 +239,8 @@ def _settings(spec: str | Mapping[str, Any]) -> dict[str, Any]:
     for key in ("dim", "max_tokens", "timeout_s"):
         if key in given and given[key] <= 0:
             raise SpecError(f"embedder {kind}: {key} is {given[key]}; expected a number above 0")
+    if given.get("dim", 0) > LARGEST_DIM:
+        raise SpecError(f"embedder {kind}: dim is {given['dim']}; expected at most {LARGEST_DIM}")
     if kind == "endpoint" and "model" not in given:
         raise SpecError(f"embedder {spec!r} names no model; expected {{endpoint: URL, model: NAME}}")
     return {"kind": kind, **given}

@@ -189,7 +189,7 @@ class Runner:
 
     async def _play(self, job: Job, agent: Agent, worker: EnvWorker) -> Trajectory:
         if self.spec.scope == "run" and job.memory_state is not None:
-            agent.resume(job.memory_state)
+            self._resume(agent, job.memory_state)
         transitions: list[Transition] = []
         info: dict[str, Any] = {}
         status, error, ended = "completed", "", "environment"
@@ -232,6 +232,16 @@ class Runner:
             metrics |= _scaffold_metrics(transitions, agent.recorder, ended) | jsonable(agent.metrics())
             trajectory = self._trajectory(job, transitions, agent, metrics, status, error)
         return trajectory
+
+    def _resume(self, agent: Agent, state: bytes) -> None:
+        try:
+            agent.resume(state)
+        except Exception as error:  # whatever a module does with a state that is not its own
+            modules = f"memory {self.spec.memory.name!r} and reflection {self.spec.reflection.name!r}"
+            raise SpecError(
+                f"the carried state cannot be taken up by {modules} ({type(error).__name__}: {error}); was it "
+                "edited, or written by another version? grow the memory again"
+            ) from error
 
     def _trajectory(
         self,

@@ -12,10 +12,9 @@ import binascii
 import difflib
 import json
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-from agentspec.carry import FILE, MemoryBank
+from agentspec.carry import MemoryBank
 from agentspec.embedding import HashEmbedder
 from agentspec.llm.none import NoLLM
 from agentspec.llm.recorder import Recorder
@@ -28,22 +27,6 @@ KINDS = ("memory", "reflection")
 START = "start"
 NUMBERS = 8
 """Rows of more numbers than these are counted, not written out."""
-
-
-def read_bank(source: str | Path) -> MemoryBank:
-    """The bank of a memory file, or of a run folder that holds one.
-
-    Raises:
-        SpecError: there is no such file, or it is no memory file.
-    """
-    path = Path(source)
-    path = path / FILE if path.is_dir() else path
-    if not path.is_file():
-        raise SpecError(f"there is no {path}; give a memory file, or the folder of a run that wrote one")
-    try:
-        return MemoryBank.load(path.read_bytes())
-    except ValueError as error:
-        raise SpecError(f"{path}: {error}") from error
 
 
 def entries(bank: MemoryBank) -> dict[str, str]:

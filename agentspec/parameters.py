@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import types
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -54,7 +55,9 @@ def parameters_of(target: Any) -> list[str]:
 
 
 def check_parameters(where: str, target: Any, params: Mapping[str, Any]) -> None:
-    """Refuse parameters that a class does not take, or takes as another type.
+    """Refuse parameters that a class does not take, or takes as another type, and numbers that mean nothing.
+
+    No number is NaN, no `*tokens` is negative, no `*temperature` negative or infinite; other ranges are the class's.
 
     Raises:
         SpecError: naming the parameter, with the nearest known ones or the type expected.
@@ -64,6 +67,12 @@ def check_parameters(where: str, target: Any, params: Mapping[str, Any]) -> None
         if key not in accepted:
             raise SpecError(f"{where} has no parameter {key!r}{suggest(str(key), accepted)}")
     check_types(where, target.__init__ if inspect.isclass(target) else target, params)
+    for key, value in params.items():
+        if isinstance(value, int | float):
+            if math.isnan(value) or (key.endswith("temperature") and not 0 <= value < math.inf):
+                raise SpecError(f"{where}: {key} is {value}; expected a finite number of at least 0")
+            if key.endswith("tokens") and value < 0:
+                raise SpecError(f"{where}: {key} is {value}; expected at least 0")
 
 
 def check_types(where: str, annotated: Any, values: Mapping[str, Any]) -> None:

@@ -14,9 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.actions import suggest
+from agentspec.embedding import embedder_of
 from agentspec.files import file_digest
+from agentspec.llm import build_llm, capabilities_of, check_llm
 from agentspec.llm.base import LLM
+from agentspec.llm.helpers import check_helpers
+from agentspec.llm.models import base_of, resolve
 from agentspec.registry import REGISTRY, SpecError
+from agentspec.simulator import can_simulate
 from agentspec.spec import MODULE_KINDS, AgentSpec, ModuleSpec
 
 SCRIPTED = ("rule_based", "random")
@@ -64,15 +69,30 @@ class Policy:
         return name if name in SCRIPTED and not self.model and not self.backend else ""
 
     def apply(self, spec: AgentSpec) -> AgentSpec:
-        """The scaffold as this policy plays it."""
+        """The scaffold as this policy plays it.
+
+        Raises:
+            SpecError: a helper model that is an adapter alone, and this policy has no local model to put it on.
+        """
         if not self.scripted:
-            return spec
+            return self._with_helpers(spec)
         quiet = {
             kind: ModuleSpec("none")
             for kind in ("memory", "reflection")
             if calls_model(kind, getattr(spec, kind).name) or REGISTRY.get(kind, getattr(spec, kind).name).needs
         }
         return replace(spec, reasoning=ModuleSpec(self.scripted), **quiet)  # type: ignore[arg-type]  # kinds are fields
+
+    def _with_helpers(self, spec: AgentSpec) -> AgentSpec:
+        """Helper models that are an adapter alone stand on this policy's model."""
+        settings = self.settings()
+        based = spec.with_base(base_of(str(settings.get("model", ""))))
+        if based is not spec and settings["backend"] != "local":
+            raise SpecError(
+                f"roles: an adapter alone stands on the policy's model, and {self.name} is served by the backend "
+                f"{settings['backend']!r}; name the model it belongs to: {{model: NAME, adapter: FOLDER}}"
+            )
+        return based
 
     def settings(self) -> dict[str, Any]:
         """What :func:`agentspec.llm.build_llm` builds this policy's backend from."""
@@ -82,14 +102,18 @@ class Policy:
         return settings | ({"adapter": self.adapter} if self.adapter else {})
 
     def check(self) -> None:
-        """Find the model's files before anything runs.
+        """Check the backend's settings and find the model's files before anything runs.
 
         Raises:
+            ValueError: settings that the backend does not take.
             ModelNotFoundError: no such model or adapter, with the remedy.
         """
         settings = self.settings()
-        if not self.scripted and settings["backend"] in ("local", "vision"):
-            from agentspec.llm.models import BUNDLED, ModelNotFoundError, resolve
+        if self.scripted:
+            return
+        check_llm(settings)
+        if settings["backend"] in ("local", "vision"):
+            from agentspec.llm.models import BUNDLED, ModelNotFoundError
 
             try:
                 resolve(settings["model"], self.adapter or None)
@@ -102,12 +126,7 @@ class Policy:
 
     def build(self) -> LLM | None:
         """The backend, loaded; ``None`` for a scripted policy."""
-        if self.scripted:
-            return None
-        from agentspec.llm import build_llm
-
-        llm: LLM = build_llm(self.settings())
-        return llm
+        return None if self.scripted else build_llm(self.settings())
 
     def identity(self) -> dict[str, Any]:
         """What makes two policies the same: the backend's settings, and weights by their content, wherever they lie."""
@@ -123,6 +142,30 @@ def weighed(settings: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(found.get(name), str) and Path(found[name]).is_dir():
             found[name] = f"weights:{weights_digest(Path(found[name]))}"
     return found
+
+
+def check_agent(policy: Policy | None, spec: AgentSpec, env: Any, name: str) -> None:
+    """Everything that can be refused before a model is loaded: settings, files, helpers, and what modules need.
+
+    Args:
+        policy: who acts, if anybody is named.
+        spec: the scaffold as the policy plays it.
+        env: an environment of the kind that is played.
+        name: of the environment.
+
+    Raises:
+        SpecError: something that a module needs is not there, or a setting that nobody takes.
+        ModelNotFoundError: no such model or adapter.
+    """
+    if policy is not None and not policy.scripted:
+        policy.check()
+        check_helpers(config for pattern, config in spec.roles.items() if spec.helped(pattern))
+        settings = policy.settings()
+        spec.check(capabilities_of(settings) | {"snapshots"}, f"backend {settings['backend']!r}")
+        if isinstance(spec.embedder, Mapping) and "endpoint" in spec.embedder:
+            embedder_of(spec.embedder)  # which asks it once
+    if not can_simulate(env):
+        spec.check(spec.needs() - {"snapshots"}, f"environment {name!r} without snapshot() and restore()")
 
 
 def calls_model(kind: str, name: str) -> bool:

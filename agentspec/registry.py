@@ -156,7 +156,9 @@ class Registry:
                     return entry
             if name not in self._known[kind]:
                 aliases = [a for e in self._known[kind].values() for a in e.declaration.aliases]
-                raise SpecError(f"unknown {kind} {name!r}{suggest(name, [*self._known[kind], *aliases])}")
+                hint = suggest(name, [*self._known[kind], *aliases])
+                own = "" if hint.startswith("; did") else "; one of your own is brought in with --import or `imports`"
+                raise SpecError(f"unknown {kind} {name!r}{hint}{own}")
         return self._known[kind][name]
 
     def register(self, kind: Kind, name: str, entry: Entry) -> None:

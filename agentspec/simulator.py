@@ -69,7 +69,12 @@ class EpisodeSimulator:
 
 def simulator_of(env: Any, worker: Worker, task: Task, perception: Perception) -> EpisodeSimulator | None:
     """The simulator of ``env``, or ``None`` if it cannot snapshot and restore."""
-    world = getattr(env, "unwrapped", env)
-    if not callable(getattr(world, "snapshot", None)) or not callable(getattr(world, "restore", None)):
+    if not can_simulate(env):
         return None
-    return EpisodeSimulator(world, worker, task, perception)
+    return EpisodeSimulator(getattr(env, "unwrapped", env), worker, task, perception)
+
+
+def can_simulate(env: Any) -> bool:
+    """Whether ``env`` can snapshot and restore."""
+    world = getattr(env, "unwrapped", env)
+    return callable(getattr(world, "snapshot", None)) and callable(getattr(world, "restore", None))

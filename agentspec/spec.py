@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -185,6 +186,11 @@ class AgentSpec:
         """YAML text of :meth:`to_data`."""
         return yaml.safe_dump(self.to_data(), sort_keys=False)
 
+    def with_base(self, model: str) -> AgentSpec:
+        """The spec with helper models that are an adapter alone put on `model`, the policy's own."""
+        roles = {k: v if {*v} & {"model", "script"} else {**v, "model": model} for k, v in self.roles.items()}
+        return self if roles == self.roles else dataclasses.replace(self, roles=roles)
+
     @property
     def label(self) -> str:
         """Short name for tables: ``react+base``, with reflection and layout where they are not the default."""
@@ -282,7 +288,7 @@ class AgentSpec:
                 modules[kind] = cls(*arguments, **spec.params)
             except SpecError:
                 raise
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise SpecError(f"{kind} {spec.name!r}: {error}") from error
         return Agent(context=context, clock=clock, recorder=recorder, services=tuple(provided), names=names, **modules)
 
@@ -296,6 +302,8 @@ class AgentSpec:
     def _check_roles(self) -> None:
         """Refuse roles of no module, and backends that say neither what nor where."""
         for pattern, backend in self.roles.items():
+            if not isinstance(pattern, str):
+                raise SpecError(f"roles: expected a pattern over module names such as 'memory.*', got {pattern!r}")
             if not self.helped(pattern):
                 modules = ", ".join(self._modules())
                 raise SpecError(f"roles: {pattern!r} matches none of the modules {modules}")
@@ -338,6 +346,11 @@ def load_yaml(source: str | Path) -> Any:
         text, where = path.read_text(encoding="utf-8"), str(path)
     else:
         where = "the given text"
+    if text.lstrip()[:1] in ("{", "["):
+        try:
+            return json.loads(text)  # YAML reads JSON too, except for numbers such as 1e-4
+        except ValueError:
+            pass
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -262,7 +263,8 @@ class Sampling:
         return replace(self, max_tokens=room, reasoning_tokens=0)
 
     def __post_init__(self) -> None:
-        bad = self.temperature < 0 or not 0 < self.top_p <= 1 or self.top_k < 0 or self.max_tokens < 1 or self.n < 1
+        bad = not 0 <= self.temperature < math.inf or not 0 < self.top_p <= 1  # NaN too
+        bad |= self.top_k < 0 or self.max_tokens < 1 or self.n < 1
         if bad or self.reasoning_tokens < 0:
             raise ValueError(
                 f"sampling parameters out of range: {self}; expected temperature >= 0, 0 < top_p <= 1, top_k >= 0, "

@@ -1,11 +1,12 @@
 """Long horizons: the context of GRPO (full history) and of SUPO (summaries) as episodes get longer.
 
-    python -m benchmarks.horizon [--json] [--turns 8 16 32 64 128] [--model smollm2-135m] [--rollouts 4]
+    python -m benchmarks.horizon [--json] [--turns 8 16 32 64 128] [--model smollm2-135m] [--rollouts 4] [--bytes]
 
 The same scripted market for both: ``grpo`` keeps the whole conversation, ``supo`` replaces it by a summary every eight
 actions. Answers come from a script, so that both agents act alike and episodes last exactly as long as they should;
 with ``--model`` they come from a model, and time and memory are those of real sampling. ``peak_context`` is the longest
-prompt plus answer of an episode in tokens (bytes for the script), ``seconds`` the wall-clock time of one episode,
+prompt plus answer of an episode in tokens (of the bundled model for the script, or ``--bytes``: scripted prompts have a
+byte for a token), ``seconds`` the time of one episode: wall-clock with a model, of the processor for the script,
 ``rss_mb`` by how much the process grew, at most, beyond its size before the episode. The curves go to
 ``docs/images/horizon.png``.
 """
@@ -19,6 +20,7 @@ import statistics
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +95,21 @@ def make_llm(model: str) -> Any:
     return LocalLLM.load(model, dtype="float32")
 
 
-def measure(llm: Any, agent: str, turns: int, options: argparse.Namespace) -> dict[str, Any]:
+def counter(llm: Any, options: argparse.Namespace) -> Callable[[Sequence[int]], int]:
+    """Token ids of a call -> how many tokens they are; bytes of a script are encoded by the bundled model."""
+    if options.model or options.bytes:
+        return len
+    from transformers import AutoTokenizer
+
+    from agentspec.llm.models import resolve
+
+    tokenizer = AutoTokenizer.from_pretrained(resolve("smollm2-135m").path)
+    return lambda ids: len(tokenizer.encode(llm.tokenizer.decode(ids)))
+
+
+def measure(
+    llm: Any, agent: str, turns: int, options: argparse.Namespace, count: Callable[[Sequence[int]], int] = len
+) -> dict[str, Any]:
     """Episodes of ``turns`` actions, one after the other: medians over them."""
     from agentspec.episode import Job, Runner
     from agentspec.spec import AgentSpec
@@ -108,10 +124,11 @@ def measure(llm: Any, agent: str, turns: int, options: argparse.Namespace) -> di
             llm.invalidate()
         release()
         with Growth() as growth:
-            start = time.perf_counter()
+            clock = time.perf_counter if options.model else time.process_time
+            start = clock()
             (episode,) = runner.run([Job(Task(MARKET, seed, world))])
-            seconds.append(time.perf_counter() - start)
-        peaks.append(max(len(c.prompt_ids) + len(c.completions[0].token_ids) for c in episode.calls))
+            seconds.append(clock() - start)
+        peaks.append(max(count([*c.prompt_ids, *c.completions[0].token_ids]) for c in episode.calls))
         grown.append(growth.peak_mb)
         ends.add(str(episode.metrics["ended"]))
     return {
@@ -123,24 +140,26 @@ def measure(llm: Any, agent: str, turns: int, options: argparse.Namespace) -> di
     }
 
 
-def draw(results: dict[str, list[dict[str, Any]]], unit: str, path: Path) -> None:
+def draw(results: dict[str, list[dict[str, Any]]], unit: str, clock: str, path: Path) -> None:
     """Peak context, time and memory over the number of turns."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import MultipleLocator
 
     panels = (
         ("peak_context", f"peak context ({unit})"),
-        ("seconds", "seconds per episode"),
-        ("rss_mb", "memory (MiB)"),
+        ("seconds", f"time of an episode ({clock})"),
+        ("rss_mb", "growth of memory (MiB)"),
     )
     figure, axes = pyplot.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
     for axis, (key, label) in zip(axes, panels, strict=True):
         for name, title in (("grpo", "GRPO, full history"), ("supo", f"SUPO, summary every {EVERY}")):
             points = results[name]
             axis.plot([p["turns"] for p in points], [p[key] for p in points], marker="o", label=title)
-        axis.set_xlabel("turns")
+        axis.set_xlabel("turns (actions of an episode)")
+        axis.xaxis.set_major_locator(MultipleLocator(16))
         axis.set_title(label, fontsize=10)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
@@ -155,6 +174,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--turns", type=int, nargs="+", default=[8, 16, 32, 64, 128])
     parser.add_argument("--model", default="", help="a model to sample from (default: a script)")
+    parser.add_argument("--bytes", action="store_true", help="count bytes of scripted prompts (needs no tokenizer)")
     parser.add_argument("--words", type=int, default=40, help="words of news in an observation")
     parser.add_argument("--rollouts", type=int, default=4, help="episodes per length, one at a time")
     parser.add_argument("--plot", type=Path, default=IMAGE, metavar="FILE")
@@ -163,8 +183,9 @@ def main() -> None:
     llm = make_llm(options.model)
     for agent in AGENTS:  # imports, caches
         measure(llm, agent, 2, options)
-    results = {agent: [measure(llm, agent, turns, options) for turns in options.turns] for agent in AGENTS}
-    draw(results, "tokens" if options.model else "bytes", options.plot)
+    count = counter(llm, options)
+    results = {agent: [measure(llm, agent, turns, options, count) for turns in options.turns] for agent in AGENTS}
+    draw(results, "bytes" if options.bytes else "tokens", "s" if options.model else "s of CPU", options.plot)
     if options.json:
         print(json.dumps(results))
         return

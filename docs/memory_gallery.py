@@ -196,5 +196,6 @@ def page(name: str) -> str:
 
 def pages() -> dict[str, str]:
     """File name -> page, of every memory."""
-    names = [n for n, e in REGISTRY.all("memory").items() if n != "none" and e.target.startswith("agentspec.")]
+    ours = {n: e for n, e in REGISTRY.all("memory").items() if n != "none" and e.target.startswith("agentspec.")}
+    names = [n for n, e in ours.items() if not e.declaration.extra]  # libraries ask and show what they like
     return {f"memory-{name}.md": page(name) for name in names}

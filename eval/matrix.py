@@ -19,6 +19,7 @@ from agentspec.actions import suggest
 from agentspec.episode import MakeEnv, make_env
 from agentspec.files import write_lines
 from agentspec.policies import Policy
+from agentspec.progress import load_policy
 from agentspec.registry import SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
 from agentspec.tasks import Tasks, task_sets
@@ -151,7 +152,7 @@ def _play_policy(
             with RayPlayer(policy, settings, workers, address, make_llm, make_env) as ray:
                 asyncio.run(each(ray, settings.concurrency and settings.concurrency * workers))
         else:
-            llm = (make_llm or Policy.build)(policy)
+            llm = (make_llm or load_policy)(policy)
             asyncio.run(each(LocalPlayer(llm, settings, make_env), settings.concurrency))
             del llm
             gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles

@@ -19,11 +19,18 @@ from eval.tables import CellSummary, metrics_of
 
 
 def reward_curve(
-    rows: Sequence[Mapping[str, Any]], path: str | Path, *, key: str = "reward", window: int = 5, title: str = ""
+    rows: Sequence[Mapping[str, Any]],
+    path: str | Path,
+    *,
+    key: str = "reward",
+    window: int = 5,
+    title: str = "",
+    unit: str = "",
 ) -> bool:
     """Draw ``key`` over ``step`` from rows of a run's ``metrics.jsonl``, with its running mean over ``window`` rows.
 
-    The band is one standard deviation of the rewards of a step (``reward_std``) where rows have it.
+    The band is one standard deviation of the rewards of a step (``reward_std``) where rows have it. ``unit`` says what
+    the numbers are.
 
     Returns:
         Whether there was anything to draw; without rows that have ``key``, no file is written.
@@ -35,18 +42,25 @@ def reward_curve(
     values = np.array([float(r[key]) for r in points])
     spread = np.array([float(r.get(f"{key}_std") or 0.0) for r in points])
     figure, axes = _figure(6.4, 4.0)
-    axes.fill_between(steps, values - spread, values + spread, alpha=0.15, linewidth=0)
-    axes.plot(steps, values, marker=".", linewidth=0.8, alpha=0.6, label=key)
+    if spread.any():
+        band = "± one standard deviation of its episodes"
+        axes.fill_between(steps, values - spread, values + spread, alpha=0.15, linewidth=0, label=band)
+    axes.plot(steps, values, marker=".", linewidth=0.8, alpha=0.6, label="mean of the update's episodes")
     if len(points) >= window > 1:
-        axes.plot(steps, running_mean(values, window), linewidth=2, label=f"mean of {window}")
-        axes.legend()
-    _label(axes, key, title)
+        axes.plot(steps, running_mean(values, window), linewidth=2, label=f"mean over {window} updates")
+    axes.legend(fontsize=8)
+    _label(axes, key, title, unit)
     _save(figure, path)
     return True
 
 
 def learning_curves(
-    runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]], path: str | Path, *, key: str = "reward", title: str = ""
+    runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]],
+    path: str | Path,
+    *,
+    key: str = "reward",
+    title: str = "",
+    unit: str = "",
 ) -> bool:
     """Draw ``key`` over ``step`` for several methods, each trained with several seeds.
 
@@ -69,11 +83,12 @@ def learning_curves(
         if curves:
             common = sorted(set.intersection(*map(set, curves)))
             means = [math.fsum(c[step] for c in curves) / len(curves) for step in common]
-            axes.plot(common, means, color=color, linewidth=2, label=f"{method} (mean of {len(curves)})")
+            axes.plot(common, means, color=color, linewidth=2, label=f"{method}, mean of {len(curves)} runs")
     if not drawn:
         return False
-    axes.legend()
-    _label(axes, key, title)
+    axes.plot([], [], color="gray", linewidth=0.7, alpha=0.6, label="thin: one run each")
+    axes.legend(fontsize=8)
+    _label(axes, key, title, unit)
     _save(figure, path)
     return True
 
@@ -135,10 +150,11 @@ def _panel(
     figure.colorbar(image, ax=axes)
 
 
-def _label(axes: Any, key: str, title: str) -> None:
-    axes.set_xlabel("step")
-    axes.set_ylabel(key)
-    axes.set_title(title or f"{key} while training")
+def _label(axes: Any, key: str, title: str, unit: str) -> None:
+    axes.set_xlabel("update (optimiser step)")
+    axes.set_ylabel(f"{key} per episode{f' ({unit})' if unit else ''}, mean")
+    axes.set_title(title or f"{key} while training: sampled episodes on training tasks")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
 
 

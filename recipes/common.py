@@ -17,13 +17,32 @@ claim_packages()
 CONFIGS = Path(__file__).parent / "configs"
 
 
-def draw_curve(config: Any, trainer: Any) -> None:
-    """The reward curve as `reward_curve.png` in the run's folder (main process, if the config asks for plots)."""
+def train_and_draw(config: Any, **how: Any) -> Any:
+    """Train, and draw the reward curve as `reward_curve.png` in the run's folder (if the config asks for plots).
+
+    Torch and TRL are imported only here: what is wrong with a configuration has been told by then.
+
+    Args:
+        how: as of `trainers.run.train`.
+
+    Returns:
+        the trainer, when all processes are through.
+    """
+    from trainers.run import train
+
+    trainer = train(config, **how)
+    trainer.accelerator.wait_for_everyone()
     if config.plots and trainer.accelerator.is_main_process:
         from eval.plots import reward_curve
         from trainers.run_folder import METRICS
 
-        reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png")
+        reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png", unit=unit(config))
+    return trainer
+
+
+def unit(config: Any) -> str:
+    """What a reward is, as a formula: `1 x earning_delta`."""
+    return " + ".join(f"{weight:g} x {name}" for name, weight in config.reward_set.weights.items())
 
 
 def run_recipe(main: Callable[[], None]) -> None:

@@ -9,17 +9,15 @@ the sheet are trained like those of the actions. What a rewrite earns is `write_
 
 from __future__ import annotations
 
-from recipes.common import CONFIGS, draw_curve, run_recipe
+from recipes.common import CONFIGS, run_recipe, train_and_draw
 
 
 def main() -> None:
     """Train actions and notes, save the adapter, draw the reward curve."""
     from trainers.arguments import parse_config
     from trainers.memory import as_memory
-    from trainers.run import train
 
-    config = as_memory(parse_config(default=CONFIGS / "memory_cpu.yaml"))
-    draw_curve(config, train(config))
+    train_and_draw(as_memory(parse_config(default=CONFIGS / "memory_cpu.yaml")))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recipes.common import run_recipe
+from recipes.common import CONFIGS, run_recipe, unit
 
 if TYPE_CHECKING:
     from eval.statistics import Estimate
@@ -37,7 +37,9 @@ def main() -> None:
     parser.add_argument("--no-train", action="store_true", help="evaluate the runs that are there")
     options = parser.parse_args()
     out = Path(options.out)
-    configs = {Path(path).stem: parse_config(default=path, argv=[]) for path in options.configs}
+    configs = {
+        Path(path).stem: parse_config(["--config", path], default=CONFIGS / "cpu.yaml") for path in options.configs
+    }
     check(configs)
     runs = {name: {seed: out / f"{name}-s{seed}" for seed in options.seeds} for name in configs}
     if not options.no_train:
@@ -71,7 +73,7 @@ def train(path: str, seed: int, folder: Path) -> None:
     Raises:
         SystemExit: it failed.
     """
-    command = [sys.executable, "-m", "recipes.grpo_delivery", "--config", path]
+    command = [sys.executable, "-m", "agentspec.cli", "train", "grpo_delivery", "--config", path]
     command += ["--seed", str(seed), "--output_dir", str(folder), "--resume", "true"]
     print(f"{folder}: {' '.join(command)}", file=sys.stderr, flush=True)
     if subprocess.run(command, check=False).returncode:
@@ -110,7 +112,7 @@ def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], o
     own = {method: c.spec.label for method, c in configs.items()}
     write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
     logs = {m: [RunLog(f).read(METRICS) for f in folders.values()] for m, folders in runs.items()}
-    learning_curves(logs, out / "curves.png")
+    learning_curves(logs, out / "curves.png", unit=unit(config))
     print((out / "study.md").read_text())
 
 

@@ -18,7 +18,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from recipes.common import CONFIGS, draw_curve, run_recipe
+from recipes.common import CONFIGS, run_recipe, train_and_draw
 
 CONTROL = "The sky was clear in the morning, and a light wind came from the west."
 """What stands in the place of every lesson in the comparison: as long as a lesson, and no advice."""
@@ -27,17 +27,15 @@ CONTROL = "The sky was clear in the morning, and a light wind came from the west
 def main() -> None:
     """Train the reflector, draw the curve of gains, evaluate: `evaluation.md` and `evaluation.jsonl`."""
     from trainers.arguments import parse_config
+
+    config = parse_config(default=CONFIGS / "retroformer_cpu.yaml")
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import RetroformerTrainer, as_retroformer
-    from trainers.run import train
 
-    config = as_retroformer(parse_config(default=CONFIGS / "retroformer_cpu.yaml"))
-    trainer = train(config, trainer_class=RetroformerTrainer, load=load_actor_and_reflector)
-    trainer.accelerator.wait_for_everyone()
-    if not trainer.accelerator.is_main_process:
-        return
-    draw_curve(config, trainer)
-    evaluate_run(config, Path(config.output_dir))
+    config = as_retroformer(config)
+    trainer = train_and_draw(config, trainer_class=RetroformerTrainer, load=load_actor_and_reflector)
+    if trainer.accelerator.is_main_process:
+        evaluate_run(config, Path(config.output_dir))
 
 
 def _unscored(runner: Any, jobs: Any) -> list[Any]:

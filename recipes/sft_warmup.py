@@ -1,9 +1,12 @@
-"""A supervised warm start from the rule-based courier, in the prompt layout that GRPO will use.
+"""A supervised warm start from a world's scripted expert, in the prompt layout that GRPO will use.
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
+    accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_minigrid.yaml
+    accelerate launch recipes/sft_warmup.py --environment '{"name": "alfred", "options": {"action_mode": "menu"}}'
 
-The adapter in `agentspec/llm/shipped/smollm2-135m-courier` was made with this command. TRL's `SFTTrainer` trains on
-the tokens the expert chose; prompts and observations are context.
+Any environment with an expert will do (`agentspec.envs.experts`). The first two made the adapters that ship
+(`agentspec/llm/shipped`). TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are
+context.
 """
 
 from __future__ import annotations
@@ -39,24 +42,12 @@ def train_warmup(config: Any) -> None:
     shown = demonstrate(config.spec, tokenizer, make_tasks(name, options, config.train_tasks))
     returns = [float(t.metrics["return"]) for t in shown.episodes]
     print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(shown.rows)} rows")
-    args = SFTConfig(
-        output_dir=config.output_dir,
-        per_device_train_batch_size=config.per_device_train_batch_size,
-        gradient_accumulation_steps=config.gradient_accumulation_steps,
-        num_train_epochs=config.num_train_epochs,
-        max_steps=config.max_steps,
-        learning_rate=config.learning_rate,
-        lr_scheduler_type=config.lr_scheduler_type,
-        warmup_steps=config.warmup_steps,
-        max_length=None,
-        logging_steps=config.logging_steps,
-        save_strategy="no",
-        report_to=config.report_to,
-        use_cpu=config.use_cpu,
-        bf16=config.bf16,
-        **{CHECKPOINTING: getattr(config, CHECKPOINTING)},
-        seed=config.seed,
+    same = (
+        "output_dir per_device_train_batch_size gradient_accumulation_steps num_train_epochs max_steps learning_rate "
+        "lr_scheduler_type warmup_steps logging_steps report_to use_cpu bf16 seed"
     )
+    given = {field: getattr(config, field) for field in (*same.split(), CHECKPOINTING)}
+    args = SFTConfig(**given, max_length=None, save_strategy="no")
     data = Dataset.from_list(shown.rows)
     trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()

@@ -8,17 +8,15 @@ and the summary's tokens are trained with the rollout's advantage.
 
 from __future__ import annotations
 
-from recipes.common import CONFIGS, draw_curve, run_recipe
+from recipes.common import CONFIGS, run_recipe, train_and_draw
 
 
 def main() -> None:
     """Train with summaries, save the adapter, draw the reward curve."""
     from trainers.arguments import parse_config
-    from trainers.run import train
     from trainers.supo import as_supo
 
-    config = as_supo(parse_config(default=CONFIGS / "supo_cpu.yaml"))
-    draw_curve(config, train(config))
+    train_and_draw(as_supo(parse_config(default=CONFIGS / "supo_cpu.yaml")))
 
 
 if __name__ == "__main__":

@@ -9,21 +9,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recipes.common import CONFIGS, draw_curve, run_recipe
+from recipes.common import CONFIGS, run_recipe, train_and_draw
 
 
 def main() -> None:
     """Train, draw the reward curve, evaluate, write `evaluation.md` and the episodes under `evaluation/`."""
     from trainers.arguments import parse_config
-    from trainers.run import train
 
     config = parse_config(default=CONFIGS / "quickstart_cpu.yaml")
-    trainer = train(config)
-    trainer.accelerator.wait_for_everyone()
-    if not trainer.accelerator.is_main_process:
-        return
-    draw_curve(config, trainer)
-    evaluate_run(config, Path(config.output_dir))
+    if train_and_draw(config).accelerator.is_main_process:
+        evaluate_run(config, Path(config.output_dir))
 
 
 def evaluate_run(config: object, folder: Path) -> None:

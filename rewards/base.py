@@ -57,6 +57,15 @@ REWARDS: dict[str, RewardEntry] = {
     "delivery": RewardEntry("rewards.delivery:delivery", "shaping: +1 per order picked up, +1 per order delivered"),
     "env": RewardEntry("rewards.env:env_reward", "the environment's own reward"),
     "success": RewardEntry("rewards.outcome:success", "1 at the last step of an episode that succeeded"),
+    "efficiency": RewardEntry(
+        "rewards.outcome:efficiency", "how short a success was (efficiency or SPL), at the last step"
+    ),
+    "goal_progress": RewardEntry(
+        "rewards.progress:goal_progress", "change of the share of goal conditions that are met"
+    ),
+    "geodesic_progress": RewardEntry(
+        "rewards.progress:geodesic_progress", "metres come nearer over the shortest path's, clipped by metres moved"
+    ),
     "outcome": RewardEntry("rewards.outcome:outcome", "the environment's primary figure, at the last step"),
     "reflection_gain": RewardEntry(
         "rewards.reflection_gain:reflection_gain", "return less that of the trial whose lesson was followed; else 0"
@@ -109,13 +118,17 @@ class RewardSet:
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None) -> None:
+        if not isinstance(weights, Mapping | None):
+            raise SpecError(f"rewards: expected {{name: weight}}, got {weights!r}")
         self.weights = {"earning_delta": 1.0} if weights is None else dict(weights)
         if not self.weights:
             raise SpecError(
                 "rewards is {}, which pays nothing; name one (`rewards: {earning_delta: 1.0}`), or leave it out"
             )
         for name, weight in self.weights.items():
-            if not math.isfinite(weight):
+            if not isinstance(name, str):
+                raise SpecError(f"rewards: expected the name of a reward, got {name!r}")
+            if not isinstance(weight, int | float) or not math.isfinite(weight):
                 raise SpecError(f"reward {name!r} has weight {weight}; expected a finite number")
         self._functions = {name: reward_entry(name).load() for name in self.weights}
 

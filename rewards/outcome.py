@@ -1,4 +1,4 @@
-"""Rewards that read what any environment declares: success, and its primary figure. Both are paid at the last step."""
+"""Rewards for what an episode came to, paid at the last step: success, efficiency, the primary figure."""
 
 from __future__ import annotations
 
@@ -19,6 +19,22 @@ def success(trajectory: Trajectory) -> tuple[float, ...]:
             "reward (env, outcome)"
         )
     return _at_the_end(achieved, trajectory)
+
+
+def efficiency(trajectory: Trajectory) -> tuple[float, ...]:
+    """How short a success was, 0 to 1: the metric `efficiency` (MiniGrid), or `spl` (ALFRED, RoboTHOR).
+
+    Raises:
+        ValueError: an environment that reports neither.
+    """
+    names = [name for name in ("efficiency", "spl") if name in trajectory.metrics]
+    if not names:
+        raise ValueError(
+            f"the reward `efficiency` needs metrics['efficiency'] or metrics['spl']; {trajectory.task.env} reports "
+            "neither. Choose another reward (success, env, outcome)"
+        )
+    # Nothing is known of an episode that was cut short, or of a layout too large to search: no success, or no bonus.
+    return _at_the_end(number(trajectory.metrics[names[0]]) or 0.0, trajectory)
 
 
 def outcome(trajectory: Trajectory) -> tuple[float, ...]:

@@ -74,6 +74,31 @@ def test_a_task_that_is_new_starts_from_the_latest_only_where_asked() -> None:
     assert MemoryBank.load(bank.as_start().dump()) == bank.as_start()
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"modules": []},
+        {"states": {"a": 3}},
+        {"states": {"a": "garbage"}},
+        {"states": {"a": "{}"}},
+        {"start": "garbage"},
+        {"latest": None, "states": None},
+    ],
+)
+def test_a_memory_file_of_another_shape_is_told(changed: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "memory.json"
+    path.write_text(json.dumps({**json.loads(MemoryBank(("none", "reflexion")).dump()), **changed}))
+    with pytest.raises(SpecError, match=r"memory\.json: a memory file with broken content .*grow the memory again"):
+        start_bank(path, SPEC)
+
+
+def test_a_state_that_its_modules_cannot_take_up_ends_the_run_with_one_line() -> None:
+    state = {"time": {"episode": 1, "before": 2, "ids": {}}, "memory": "", "reflection": "bnVsbA=="}  # null
+    bank = MemoryBank(("none", "reflexion"), start=json.dumps(state))
+    with pytest.raises(SpecError, match="cannot be taken up by memory 'none' and reflection 'reflexion'"):
+        run_in_order(Runner(SPEC, ScriptedLLM(Idler())), [Job(A)], bank)
+
+
 def test_episodes_in_order_learn_from_each_other() -> None:
     idler = Idler()
     played, bank = run_in_order(Runner(SPEC, ScriptedLLM(idler)), [Job(t) for t in (A, B, C)])

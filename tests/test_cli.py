@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from agentspec.carry import MemoryBank
 from agentspec.cli import expected_errors, fail, main
 from agentspec.cli.arguments import key_values, labelled_spec, parse_seeds
 from agentspec.cli.errors import is_expected, one_line
+from agentspec.policies import Policy
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.trajectory import read_trajectories
 from rewards import REWARDS
@@ -43,6 +45,17 @@ class DrawnEnv(ToyEnv):
 DRAWN = "agentspec-test/Drawn-v0"
 if DRAWN not in gymnasium.registry:
     gymnasium.register(DRAWN, entry_point=DrawnEnv)
+
+
+class ForgetfulEnv(ToyEnv):
+    """The toy without snapshots."""
+
+    snapshot = None  # type: ignore[assignment]
+
+
+FORGETFUL = "agentspec-test/Forgetful-v0"
+if FORGETFUL not in gymnasium.registry:
+    gymnasium.register(FORGETFUL, entry_point=ForgetfulEnv)
 
 
 def prices(seed: int) -> list[int]:
@@ -151,6 +164,10 @@ def test_gif(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_bad_input_is_one_line_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("reasoning: direct\nmemory: {name: base\n")
+    odd, binary = tmp_path / "odd.yaml", tmp_path / "binary.yaml"
+    odd.write_text("gpt: {inputs: 1}\n")
+    binary.write_bytes(b"\xff\xfe")
+    (tmp_path / "adapter_config.json").write_text("[]")
     toy = ("run", "--env", TOY)
     for argv, parts in (
         (("run", "--env", "deliverybnch"), ("deliverybnch", "did you mean deliverybench")),
@@ -162,16 +179,32 @@ def test_bad_input_is_one_line_with_a_remedy(tmp_path: Path, capsys: pytest.Capt
         (toy, ("calls a model and none was named", "--policy")),
         ((*toy, "--policy", "rule-based", "--adapter", "x"), ("--adapter", "leave it out")),
         ((*toy, *SELL, "--option", "menu"), ("expected KEY=VALUE",)),
-        ((*toy, *SELL, "--option", "nonsense=1"), ("refused its options",)),
+        ((*toy, *SELL, "--option", "nonsense=1"), ("takes no option 'nonsense'", "known: fault")),
+        (("run", "--policy", "random", "--option", "imagess=1"), ("did you mean images",)),
+        (("run", "--policy", "random", "--option", "shift_hours=long"), ("shift_hours must be a number",)),
+        (("run", "--policy", "random", "--shift-hours", "-1"), ("--shift-hours", "above 0")),
+        (("run", "--policy", "random", "--option", "shift_hours=-1"), ("shift_hours is -1", "above 0")),
+        ((*toy, *SELL, "--max-steps", "0"), ("--max-steps", "at least 1, got 0")),
+        ((*toy, *SELL, "--seed", "-1"), ("--seed", "at least 0, got -1")),
+        ((*toy, *SELL, "--timeout", "nan"), ("--timeout", "above 0")),
+        ((*toy, *SELL, "--concurrency", "0"), ("--concurrency", "at least 1")),
+        ((*toy, *SELL, "--prices", str(odd)), ("input, output and cached",)),
+        ((*toy, *SELL, "--spec", str(binary)), ("no UTF-8 text",)),
+        ((*toy, "--policy", str(tmp_path)), ("adapter_config.json is malformed",)),
+        ((*toy, "--spec", "memory: my_very_own"), ("known: ", "--import")),
         ((*toy, *SELL, "--sampling", "temperature=-1"), ("temperature >= 0",)),
         ((*toy, *SELL, "--llm", "colour=1"), ("unknown key 'colour'",)),
         ((*toy, *SELL, "--episodes", "0"), ("at least 1",)),
         ((*toy, *SELL, "--prices", str(tmp_path / "none.yaml")), ("No such file",)),
-        (("run", "--seed", "x"), ("invalid int value", "agentspec run --help")),
+        (("run", "--seed", "x"), ("expected a whole number, got 'x'", "agentspec run --help")),
         (("lsit",), ("invalid choice",)),
         ((), ("required: COMMAND",)),
         (("view", str(tmp_path / "none.jsonl")), ("No such file", "check the path")),
-        (("view", str(broken)), ("broken.yaml, line 1",)),
+        (("view", str(broken)), ("broken.yaml holds no trajectories", "`agentspec run --out`", "--memory")),
+        (("view", "--memory", str(broken)), ("broken.yaml: not a memory file", "memory.json")),
+        (("train", "grpo_delivery", "--config", "quickstart"), ("did you mean quickstart_cpu",)),
+        (("train", "grpo_delivery", "--learning_rat", "1"), ("unknown option", "did you mean --learning_rate")),
+        (("train", "grpo"), ("invalid choice: 'grpo'", "grpo_delivery")),
         (("export", str(tmp_path / "none"), "--to", str(tmp_path / "x")), ("no run folder", "output_dir")),
         (("eval", "--policies", "random", "--out", str(tmp_path / "o"), "--seeds", "3-1"), ("name no seed",)),
     ):
@@ -275,6 +308,59 @@ def test_list_json_has_every_name_with_profile_and_needs(capsys: pytest.CaptureF
     assert found["reasoning"]["cot"]["calls"]["step"] == [1, 4]
     assert main(["list", "reasoning"]) == 0
     assert "1-4 calls per step" in capsys.readouterr().out
+    assert main(["list", "rewards"]) == 0
+    assert capsys.readouterr().out.startswith("reward\n")
+
+
+def test_the_list_is_a_table_of_two_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "memories"]) == 0
+    heading, *lines = capsys.readouterr().out.splitlines()
+    wide = max(map(len, REGISTRY.entries["memory"]))
+    assert heading == "memory" and max(map(len, lines)) <= 116
+    # A name stands in the first column, or the line goes on with the text above; the text begins in one column.
+    assert [line[2 : wide + 2].rstrip() for line in lines if line[2] != " "] == sorted(REGISTRY.entries["memory"])
+    assert {line[wide + 2 : wide + 4] for line in lines} == {"  "} and all(line[wide + 4] != " " for line in lines)
+
+
+def test_a_memory_file_given_as_trajectories_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "x.memory.json"
+    path.write_bytes(MemoryBank(("base", "none")).dump())
+    assert f"agentspec view --memory {path}" in refused(capsys, "view", str(path))
+
+
+LATE = {
+    "a setting nobody takes": (["--llm", "dtyp=float32"], "did you mean dtype"),
+    "a value of the wrong type": (["--llm", "max_batch=many"], "max_batch must be a whole number"),
+    "no batch": (["--llm", "max_batch=0"], "max_batch is 0; expected at least 1"),
+    "a value out of its list": (["--llm", "dtype=float17"], "dtype must be 'auto' or"),
+    "no embedder": (["--spec", "memory: generative"], "needs an embedder"),
+    "no such adapter of a helper": (
+        ["--spec", "{memory: summary, roles: {'memory.*': {adapter: none}}}"],
+        "none is no",
+    ),
+    "no snapshots": (["--spec", "reasoning: lats", "--env", FORGETFUL], "snapshots"),
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "case"),
+    [("run", case) for case in LATE] + [("eval", case) for case, (options, _) in LATE.items() if "--llm" in options],
+)
+def test_what_cannot_work_is_told_before_the_model_loads(
+    case: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("transformers")
+
+    def load(self: Policy) -> Any:
+        raise AssertionError("the model was loaded")
+
+    monkeypatch.setattr(Policy, "build", load)
+    (tmp_path / "config.json").write_text("{}")  # a model's folder, as far as can be told without loading it
+    options, message = LATE[case]
+    options = [o.replace("--spec", "--specs") if command == "eval" else o for o in options]
+    who = ["--policies" if command == "eval" else "--policy", str(tmp_path)]
+    out = ["--out", str(tmp_path / "out")]
+    assert message in refused(capsys, command, *([] if FORGETFUL in options else ["--env", TOY]), *who, *out, *options)
 
 
 def test_view_prints_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -312,6 +398,15 @@ def test_eval_prints_and_writes_the_matrix(tmp_path: Path, capsys: pytest.Captur
     out, err = capsys.readouterr()
     assert [c["episodes"] for c in json.loads(out)] == [3, 3] and err == ""  # nothing was played again
     assert "labelled 'a'" in refused(capsys, *command, "--specs", "a=memory: base", "a=memory: none")
+
+
+def test_eval_without_its_packages_plays_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    out = tmp_path / "out"
+    told = refused(capsys, "eval", "--env", TOY, "--policies", "random", "--out", str(out))
+    assert "scipy" in told and "agentspec-rl[eval]" in told and not out.exists()
 
 
 def test_export_says_what_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

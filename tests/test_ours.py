@@ -52,9 +52,8 @@ def test_a_recipe_trains_with_our_trainers(users_folder: Path) -> None:
     (users_folder / "recipes" / "__init__.py").unlink()
     (users_folder / "recipes").rmdir()
     done = in_folder(users_folder, str(ROOT / "recipes" / "grpo_delivery.py"), "--config", "none.yaml")
-    assert (
-        done.returncode == 2
-        and done.stderr == "agentspec: error: no such YAML file: none.yaml; give a path to an existing file\n"
+    assert done.returncode == 2 and done.stderr.startswith(
+        "agentspec: error: no such YAML file: none.yaml; give a path to an existing file, or"
     )
 
 

@@ -31,6 +31,18 @@ def test_a_mistyped_policy_is_told_the_nearest() -> None:
     assert "did you mean" not in str(told.value)
 
 
+def test_an_adapter_alone_helps_on_the_policy_s_model(tmp_path: Path) -> None:
+    spec = AgentSpec.from_data({"memory": "summary", "roles": {"memory.*": {"adapter": "notes"}}})
+    assert Policy("m", "some-model").apply(spec).roles == {"memory.*": {"adapter": "notes", "model": "some-model"}}
+    # A policy that is itself an adapter: the helper stands on the same base.
+    (tmp_path / "adapter_config.json").write_text('{"base_model_name_or_path": "owner/base"}')
+    assert Policy("m", str(tmp_path)).apply(spec).roles["memory.*"]["model"] == "owner/base"
+    with pytest.raises(SpecError, match="served by the backend 'openai'; name the model"):
+        Policy("m", "some-model", backend={"backend": "openai"}).apply(spec)
+    own = AgentSpec.from_data({"memory": "summary", "roles": {"memory.*": {"model": "x", "adapter": "notes"}}})
+    assert Policy("m", "some-model").apply(own) is own
+
+
 def test_a_scripted_policy_takes_the_place_of_reasoning() -> None:
     spec = AgentSpec.from_data({"reasoning": "react", "memory": {"name": "base", "window": 3}})
     played = Policy("random").apply(spec)

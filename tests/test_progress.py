@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+from typing import Any
+
+import pytest
 
 from agentspec.episode import Job, Runner
 from agentspec.llm.scripted import ScriptedLLM
-from agentspec.progress import duration, episode_progress
+from agentspec.policies import Policy
+from agentspec.progress import duration, episode_progress, load_policy, model_progress
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
 from tests.toy_env import TOY
@@ -28,6 +32,53 @@ def test_a_short_batch_says_nothing() -> None:
     after(None)
     after(None)
     assert out.getvalue() == ""
+
+
+def test_the_first_prompt_is_announced_and_later_only_what_takes_long() -> None:
+    now, out = [0.0], io.StringIO()
+    before = model_progress(every_s=10.0, stream=out, clock=lambda: now[0])
+    # Reads 1,900 tokens at 50 tokens/s, writes 4, then a second prompt within the ten seconds.
+    for at, reading, written in ((0.0, 1900, 0), (10.0, 1400, 0), (12.0, 1300, 0), (38.0, 0, 0), (48.0, 0, 4)):
+        now[0] = at
+        before(reading, written)
+    before(90, 0)
+    assert out.getvalue().splitlines() == [
+        "  reading a prompt of 1,900 tokens ...",
+        "  read 500 of 1,900 tokens, 50.0 tokens/s, about 28 s left",
+        "  0 tokens written so far ...",
+        "  4 tokens written so far ...",
+    ]
+
+
+def test_a_local_model_tells_before_every_forward() -> None:
+    pytest.importorskip("transformers")
+    from agentspec.llm.local import LocalLLM
+    from tests.tiny import tiny_model, tiny_tokenizer
+
+    tokenizer, told = tiny_tokenizer(), []
+    llm = LocalLLM(tiny_model(tokenizer), tokenizer, name="tiny")
+    llm.watch(lambda reading, written: told.append((reading, written)))
+    spec = AgentSpec.from_data({"sampling": {"max_tokens": 4}})
+    [episode] = Runner(spec, llm, max_steps=1).run([Job(Task(TOY, 0))])
+    call = episode.calls[0]  # an answer that is no action is asked for again
+    forwards = len(call.completions[0].token_ids)
+    assert told[:forwards] == [(len(call.prompt_ids), 0), *((0, n) for n in range(1, forwards))]
+
+
+def test_loading_is_said_and_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Model:
+        watched = None
+
+        def watch(self, watch: Any) -> None:
+            self.watched = watch
+
+    model, out = Model(), io.StringIO()
+    monkeypatch.setattr(Policy, "build", lambda self: model)
+    assert load_policy(Policy("m", "some-model"), out) is model and model.watched is not None
+    assert out.getvalue() == "loading m ...\nm loaded in 0 s\n"
+    out.truncate(0)
+    load_policy(Policy("random"), out)
+    assert not out.getvalue()
 
 
 def test_durations() -> None:

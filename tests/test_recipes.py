@@ -25,7 +25,8 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
 from recipes.common import CONFIGS, run_recipe
-from trainers.arguments import OURS, merged, parse_config, read_config
+from trainers.ahead import KNOWN, OURS
+from trainers.arguments import merged, parse_config, read_config
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
 from trainers.run import train
@@ -53,7 +54,7 @@ def test_the_quick_start(tmp_path: Path) -> None:
     config = parsed("quickstart_cpu.yaml")
     assert config.model == "smollm2-135m" and config.adapter and config.use_cpu
     assert config.rewards == {"earning_delta": 1.0} and config.loss_type in ("dapo", "cispo")
-    assert notes(config) == []
+    assert list(notes(config)) == []
     # Whole groups, of rollouts that are compared with each other.
     assert rollouts_per_update(config) % config.num_generations == 0
     assert parse_config([], default=CONFIGS / "quickstart_cpu.yaml").output_dir == config.output_dir
@@ -156,6 +157,69 @@ def test_another_module_brings_its_own_parameters() -> None:
 def test_what_cannot_be_extended(tmp_path: Path, files: dict[str, str], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         read_config(write_yaml(tmp_path, **files) / "top.yaml")
+
+
+def test_what_ships_is_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    default = CONFIGS / "quickstart_cpu.yaml"
+    shipped = read_config(default)
+    assert read_config("quickstart_cpu", shelf=CONFIGS) == read_config("quickstart_cpu.yaml", shelf=CONFIGS) == shipped
+    (tmp_path / "mine.yaml").write_text("extends: quickstart_cpu\nmax_steps: 1\n")
+    assert parse_config(["--config", "mine.yaml", *ON_CPU], default=default).max_steps == 1
+    # A file of one's own comes before what ships.
+    (tmp_path / "quickstart_cpu.yaml").write_text("extends: cpu.yaml\noutput_dir: mine\n")
+    assert read_config("quickstart_cpu.yaml", shelf=CONFIGS)["output_dir"] == "mine"
+    with pytest.raises(SpecError, match="did you mean retroformer_cpu"):
+        read_config("retroformer", shelf=CONFIGS)
+
+
+def test_names_are_checked_before_torch_is_imported(tmp_path: Path) -> None:
+    """In a process of its own: this one has torch already."""
+    cases = {
+        "--agent {reasoning: raect}": "did you mean react",
+        "--agent nosuch.yaml": "no such YAML file",
+        "--environment {name: deliverybnch}": "did you mean deliverybench",
+        "--environment {name: deliverybench, options: {sise: 1}}": "did you mean size",
+        "--rewards {earnings: 1}": "did you mean earning_delta",
+        "--validation_specs [{memory: bsae}]": "did you mean base",
+        "--estimator grop": "did you mean grpo",
+        "--loss-type dapoo": "did you mean dapo",
+        "--model no-such-model": "no model 'no-such-model'",
+        "--learning_rat 1": "did you mean --learning_rate",
+        "--config quickstart": "did you mean quickstart_cpu",
+    }
+    code = f"""
+import sys
+from recipes.common import CONFIGS
+from trainers.arguments import parse_config
+for option, expected in {cases!r}.items():
+    try:
+        parse_config(option.split(" ", 1), default=CONFIGS / "quickstart_cpu.yaml")
+    except ValueError as error:
+        assert expected in str(error), (option, error)
+    except Exception as error:
+        assert expected in str(error) and type(error).__name__ == "ModelNotFoundError", (option, error)
+    else:
+        raise AssertionError(option)
+assert not {{"torch", "transformers", "trl"}} & sys.modules.keys()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_field_is_known_ahead() -> None:
+    assert {f.name for f in fields(ScaffoldConfig)} == KNOWN
+
+
+def test_structures_are_given_as_json_or_yaml() -> None:
+    for text in (
+        '{"reasoning": "react", "sampling": {"temperature": 1e-1}}',
+        "{reasoning: react, sampling: {temperature: 0.1}}",
+    ):
+        config = parse_config(["--agent", text, *ON_CPU], default=CONFIGS / "quickstart_cpu.yaml")
+        assert config.spec.reasoning.name == "react" and config.spec.sampling.temperature == 0.1
 
 
 # --- the command line ------------------------------------------------------------------------------------------------

@@ -24,7 +24,6 @@ def model_card(title: str, config: Mapping[str, Any], spec: Any, *, adapter: boo
     """Markdown with the hub's metadata at the top.
 
     Args:
-        title: name of the run or export.
         config: fields of the training configuration, as far as they are known; `model` is the base model.
         spec: the agent as plain data; nothing if unknown.
         adapter: whether the weights are a PEFT adapter on the base model, or a whole model.

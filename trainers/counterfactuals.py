@@ -43,12 +43,9 @@ class WithheldError(ContextOverflowError):
 
 @dataclass
 class Replayed:
-    """A backend that gives the recorded answers up to a write, then the write or nothing, then the live model's.
+    """A backend that gives the recorded answers up to the write of `plan`, then it or nothing, then those of `llm`.
 
     Args:
-        llm: the live model.
-        recorded: the episode.
-        plan: which of its writes, and whether it is made.
         is_write: path of a call -> whether it writes.
     """
 
@@ -123,13 +120,9 @@ def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) 
 def play_beside(
     runner: Runner, jobs: Sequence[Job], episodes: Sequence[ScoredEpisode], rule: CreditRule, *, retries: int = 0
 ) -> list[ScoredEpisode]:
-    """The episodes with their counterfactuals, as the rule wants them.
+    """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants.
 
     Args:
-        runner: what played the episodes.
-        jobs: of the episodes, in order.
-        episodes: in order.
-        rule: which counterfactuals, and how they are scored.
         retries: as of `trainers.rollouts.collect`: a repeated episode had another seed.
     """
     wanted = [
@@ -195,11 +188,9 @@ def records(episodes: Sequence[ScoredEpisode]) -> list[Trajectory]:
 def attach(
     episodes: Sequence[ScoredEpisode], beside: Sequence[Trajectory], rule: CreditRule, problems: list[str] | None = None
 ) -> list[ScoredEpisode]:
-    """Give every episode those of its counterfactuals that the rule wants, scored.
+    """Give every episode those of its counterfactuals that the rule wants, scored; all are in the order of records.
 
     Args:
-        episodes: in the order in which the counterfactuals were recorded.
-        beside: all of them, in order.
         problems: where to say what is missing, left over or not what it claims (the audit's).
 
     Raises:

@@ -83,8 +83,6 @@ def check_trained(episodes: Sequence[Trajectory], train: TrainFilter, gather: Ca
     A rank that raised alone would leave the others waiting for it.
 
     Args:
-        episodes: this rank's.
-        train: says which calls are trained.
         gather: list of this rank -> concatenated lists of all ranks.
 
     Raises:

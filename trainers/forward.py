@@ -196,10 +196,10 @@ def frozen_output(
     model: nn.Module,
     layers: Sequence[nn.Module],
     rows: Sequence[Row],
+    recorded: Recorded | None = None,
     *,
     packing: Packing = "padded",
     tokens_per_forward: int = 0,
-    recorded: Recorded = lambda tokens: None,
     limit: int = LIMIT,
 ) -> FrozenOutput | None:
     """What comes out of the frozen `layers` of `model` for the trained rows of a round, as many as fit into `limit`.
@@ -220,7 +220,7 @@ def frozen_output(
     tree = build_tree(tokens)
     states, missing = weights.new_empty(len(tree.tokens), width), []
     for i, read in enumerate(tokens):
-        known = recorded(read)
+        known = recorded(read) if recorded else None
         if known is None:
             missing.append(i)
         else:

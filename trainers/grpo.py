@@ -79,12 +79,7 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         self._played: list[ScoredEpisode] = []
         self._buffered_inputs: Any = None
         self._last_loaded_step = -1
-        super().__init__(
-            model=model,
-            args=args,
-            reward_funcs=[named(name) for name in self.rewards_used.weights],
-            **kwargs,
-        )
+        super().__init__(model, [named(name) for name in self.rewards_used.weights], args, **kwargs)
         self.loss_spec = loss(args.loss_type)
         self.loss_type = self.loss_spec.trl  # whose code of TRL's computes it, if any does
         for policy in filter(None, (self.model, self.ref_model)):
@@ -185,14 +180,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             with vllm_round(self.vllm_generation, stale=stale):
                 yield
             return
-        invalidate = getattr(self.llm, "invalidate", None)
-        if invalidate is not None:
-            invalidate()
+        getattr(self.llm, "invalidate", lambda: None)()
         yield
-
-    def _credit(self) -> Credited:
-        """Rows of this rank's episodes, with the advantages of whole groups."""
-        return self.credit_rule.credit(self._played, rank=self.accelerator.process_index, gather=gather_object)
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""
@@ -218,7 +207,8 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
             self._below = None  # not held while episodes are played
             self._played = self._play_round(generation_batch)
             self._memory = self._carried_memory()
-            credited = self._credit()
+            rank = self.accelerator.process_index
+            credited = self.credit_rule.credit(self._played, rank=rank, gather=gather_object)
             self._check_trained()
             self._buffered_inputs = self._collated(self._partitioned(credited.rows))
             self._log_episodes(credited)
@@ -228,26 +218,20 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
 
     def _partitioned(self, rows: Sequence[Row]) -> list[list[Row]]:
         """Rows in micro-batches; every rank has as many, of as many rows."""
-        count = self.args.steps_per_generation
-        largest = max(gather_object([len(rows)]))
-        return partition(
-            rows,
-            count,
-            padding=padding_row(self._tokenizer.pad_token_id),
-            size=-(-max(1, largest) // count),
-            by_prefix=self.args.packing == "tree",
-        )
+        count, padding = self.args.steps_per_generation, padding_row(self._tokenizer.pad_token_id)
+        size = -(-max(1, *gather_object([len(rows)])) // count)
+        return partition(rows, count, padding=padding, size=size, by_prefix=self.args.packing == "tree")
 
-    def _collated(self, micro_batches: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
+    def _collated(self, micro_batches: list[list[Row]]) -> list[dict[str, Any]]:
         """What the loss reads of each micro-batch; the denominator is that of the whole round, on all ranks."""
         device = self.accelerator.device
         tokens = sum(gather_object([sum(r.sequence.trained for rows in micro_batches for r in rows)]))
         size = UpdateSize(tokens, self.args.generation_batch_size, self.args.max_completion_length)
         denominator = torch.tensor(self.loss_spec.denominator(size), device=device)
-        recorded = {"recorded": self._recorder.find} if self._recorder else {}
+        policy, recorded = self.accelerator.unwrap_model(self.model), self._recorder.find if self._recorder else None
         with self.accelerator.autocast():
-            policy, all_rows = self.accelerator.unwrap_model(self.model), [r for rows in micro_batches for r in rows]
-            self._below = frozen_output(policy, self._frozen, all_rows, **recorded, **self._packing)
+            everything = [r for rows in micro_batches for r in rows]
+            self._below = frozen_output(policy, self._frozen, everything, recorded, **self._packing)
         counts = gather_object([(len(rows), sum(r.episode >= 0 for r in rows)) for rows in micro_batches])
         padded = sum(n for n, _ in counts) / max(1, sum(n for _, n in counts))
         batches = []

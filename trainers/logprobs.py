@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
 
 def sampled_logprobs(
@@ -62,16 +63,12 @@ def _restrict(
     scaled: torch.Tensor, tokens: torch.Tensor, allowed: Sequence[tuple[int, ...]]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Logits of the allowed ids only (K, A), padded with -inf, and each token's place among them (K,)."""
-    width = max(len(a) for a in allowed)
-    ids = torch.zeros(len(allowed), width, dtype=torch.long)
-    outside = torch.ones(len(allowed), width, dtype=torch.bool)
-    places = []
-    for row, (choices, token) in enumerate(zip(allowed, tokens.tolist(), strict=True)):
+    for choices, token in zip(allowed, tokens.tolist(), strict=True):
         if token not in choices:
             raise ValueError(f"token {token} is not among the ids its constraint allowed: {choices}")
-        ids[row, : len(choices)] = torch.tensor(choices)
-        outside[row, : len(choices)] = False
-        places.append(choices.index(token))
+    ids = pad_sequence([torch.tensor(choices) for choices in allowed], batch_first=True)
+    outside = torch.arange(ids.shape[1])[None] >= torch.tensor([len(choices) for choices in allowed])[:, None]
+    places = [choices.index(token) for choices, token in zip(allowed, tokens.tolist(), strict=True)]
     device = scaled.device
     narrowed = scaled.gather(1, ids.to(device)).masked_fill(outside.to(device), -torch.inf)
     return narrowed, torch.tensor(places, device=device)

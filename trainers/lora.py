@@ -53,11 +53,12 @@ class _Merged(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> Any:
         x, a, b, weight = ctx.saved_tensors
         rows, out = x.flatten(0, -2), gradient.flatten(0, -2)
-        of_a = ctx.scale * (out @ b).t() @ rows
-        of_b = ctx.scale * out.t() @ (rows @ a.t())
+        # Thin products this way round: the other takes MKL up to five times as long.
+        of_a = ctx.scale * ((b.t() @ out.t()) @ rows)
+        of_b = ctx.scale * ((a @ rows.t()) @ out).t()
         of_x = None
         if ctx.needs_input_grad[0]:
-            of_x = _product(gradient, torch.addmm(weight, b, a, alpha=ctx.scale).t().contiguous(), None)
+            of_x = _product(gradient, torch.addmm(weight.t(), a.t(), b.t(), alpha=ctx.scale), None)
         return of_x, of_a, of_b, None, None, None
 
 

@@ -7,9 +7,13 @@ in what follows from it.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from agentspec.registry import SpecError
 from trainers.checks import own_memory_paths
-from trainers.config import ScaffoldConfig
+
+if TYPE_CHECKING:
+    from trainers.config import ScaffoldConfig
 
 PATTERN = "memory.*"
 

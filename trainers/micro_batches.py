@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
-from trainers.sequences import Row, TokenSequence
+from trainers.sequences import Advantage, Row, TokenSequence
 
 ROWS = "rows"
 """Key under which a micro-batch carries its rows beside the tensors that TRL reads."""
@@ -66,23 +67,13 @@ def collate(rows: Sequence[Row], pad: int, device: torch.device | str = "cpu") -
     Shapes with B rows of at most L tokens: `prompt_ids`, `prompt_mask` (B, 1); `completion_ids`, `completion_mask`,
     `tool_mask` and `sampled_logprobs` (B, L-1); `advantages` (B,) or, if any row has one per token, (B, L-1).
     """
-    length = max(len(r.sequence) for r in rows)
-    ids = torch.full((len(rows), length), pad, dtype=torch.long)
-    attention = torch.zeros_like(ids)
-    mask = torch.zeros_like(ids)
-    logprobs = torch.zeros(len(rows), length)
+    sequences = [r.sequence for r in rows]
+    ids = _padded([s.tokens for s in sequences], torch.long, pad)
+    attention = _padded([[1] * len(s) for s in sequences], torch.long)
+    mask = _padded([s.mask for s in sequences], torch.long)
+    logprobs = _padded([s.logprobs for s in sequences])
     per_token = any(not isinstance(r.advantage, (int, float)) for r in rows)
-    advantages = torch.zeros(len(rows), length) if per_token else torch.zeros(len(rows))
-    for i, row in enumerate(rows):
-        n = len(row.sequence)
-        ids[i, :n] = torch.tensor(row.sequence.tokens)
-        attention[i, :n] = 1
-        mask[i, :n] = torch.tensor(row.sequence.mask)
-        logprobs[i, :n] = torch.tensor(row.sequence.logprobs)
-        if per_token:
-            advantages[i, :n] = torch.tensor(row.advantage)
-        else:
-            advantages[i] = row.advantage  # type: ignore[assignment]  # a number: per_token is False
+    advantages = _padded([_each(r.advantage, len(r.sequence) if per_token else 1) for r in rows])
     batch = {
         "prompt_ids": ids[:, :1],
         "prompt_mask": attention[:, :1],
@@ -90,6 +81,15 @@ def collate(rows: Sequence[Row], pad: int, device: torch.device | str = "cpu") -
         "completion_mask": attention[:, 1:],
         "tool_mask": mask[:, 1:],
         "sampled_logprobs": logprobs[:, 1:],
-        "advantages": advantages[:, 1:] if per_token else advantages,
+        "advantages": advantages[:, 1:] if per_token else advantages[:, 0],
     }
     return {name: tensor.to(device) for name, tensor in batch.items()}
+
+
+def _padded(lists: Sequence[Sequence[float]], dtype: torch.dtype = torch.float32, pad: int = 0) -> torch.Tensor:
+    return pad_sequence([torch.tensor(v, dtype=dtype) for v in lists], batch_first=True, padding_value=pad)
+
+
+def _each(advantage: Advantage, count: int) -> Sequence[float]:
+    """One per token, where the row has one number for all."""
+    return [advantage] * count if isinstance(advantage, (int, float)) else advantage

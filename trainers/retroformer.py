@@ -30,13 +30,14 @@ from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
 from agentspec.spec import AgentSpec, ModuleSpec, load_yaml
 from agentspec.trajectory import Trajectory
-from trainers.checks import REFLECTION, REWARD, check_retroformer
+from trainers.checks import REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
 from trainers.rollouts import collect, local_llm
 from trainers.sequences import TrainFilter
+from trainers.unread import REFLECTION
 
 ADAPTERS = {PATH: TRAINED, "*": ACTOR}
 """Which adapter answers: lessons come from the trained one, everything else from the actor's."""
@@ -69,14 +70,7 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
 
 
 class RetroformerTrainer(ScaffoldGRPOTrainer):
-    """GRPO for the reflector of a frozen actor.
-
-    Args:
-        model: a PEFT model as of `trainers.policy.load_actor_and_reflector`.
-        args: as of `as_retroformer`.
-        make_llm: model, tokenizer -> a backend that gives each call its adapter.
-        kwargs: as of `trainers.grpo.ScaffoldGRPOTrainer`.
-    """
+    """GRPO for the reflector of a frozen actor: `model` of `load_actor_and_reflector`, `args` of `as_retroformer`."""
 
     def __init__(
         self,

@@ -47,12 +47,10 @@ def rollout_jobs(
     group: int = 1,
     memory: bytes | None = None,
 ) -> list[Job]:
-    """One job per row.
+    """One job per row of this rank's part of the generation batch.
 
     Args:
-        rows: this rank's part of the generation batch.
-        seed: seed of the run.
-        round: number of the generation round; another round samples anew.
+        seed, round: of the run, and the number of the generation round: another one samples anew.
         first: global index of the first row, so that rollouts of a group that spans ranks differ.
         group: rollouts per task.
         memory: the run's `agentspec.carry.MemoryBank` as bytes (with `scope: run`): all rollouts of a task start
@@ -70,7 +68,6 @@ def starting_states(tasks: Sequence[Task], memory: bytes | None, *, unseen: bool
     """What an episode of each task starts from, out of a run's memory.
 
     Args:
-        tasks: in order.
         memory: a `MemoryBank` as bytes; `None`: nothing is carried.
         unseen: tasks that the run does not train on: without a state of their own they start from the latest.
     """

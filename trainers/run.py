@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,12 +14,11 @@ from transformers import PrinterCallback, ProgressCallback
 from agentspec.tasks import make_tasks
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
-from trainers.folder_lock import hold
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.report import Bar, TerminalReport
 from trainers.rollouts import task_rows
-from trainers.run_folder import last_complete_checkpoint
+from trainers.run_folder import hold, last_complete_checkpoint
 
 
 def train(
@@ -47,8 +45,6 @@ def train(
         SpecError: the configuration cannot work, or another run is writing into its folder.
         KeyboardInterrupt: after a line that says how to go on.
     """
-    # Deprecations between libraries: nothing that whoever trains could change.
-    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(transformers|trl|peft|accelerate|datasets)\b")
     config.check()
     folder = Path(config.output_dir)
     last = last_complete_checkpoint(folder) if config.resume else None

@@ -8,9 +8,13 @@ configuration is SUPO and fills in what follows from it.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from agentspec.registry import SpecError
 from agentspec.spec import ModuleSpec
-from trainers.config import ScaffoldConfig
+
+if TYPE_CHECKING:
+    from trainers.config import ScaffoldConfig
 
 MEMORY = "summary"
 PATTERN = f"memory.{MEMORY}"

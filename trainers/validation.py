@@ -87,8 +87,7 @@ class Validation(Base):
 
         Args:
             eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
-            ignore_keys: not used (part of the base class's signature).
-            metric_key_prefix: stands before every metric's name.
+            ignore_keys: not used.
         """
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
         tasks = [task_of(row) for row in rows]

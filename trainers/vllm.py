@@ -114,10 +114,7 @@ def importance_ratio(
     `mask` is 0. Truncated importance sampling, token by token, as TRL's.
 
     Args:
-        logps, sampled, mask: (B, T): recomputed and recorded log-probabilities, and which tokens are trained.
-
-    Returns:
-        (B, T), without gradient.
+        logps, sampled, mask: (B, T), as the result: log-probabilities recomputed and recorded; what is trained.
     """
     ratio = ((logps.detach() - sampled) * mask).exp()
     least, most = (0.0 if low is None else low), (torch.inf if high is None else high)

@@ -81,8 +81,6 @@ class WriteCredit:
     """One row of the table.
 
     Args:
-        name: as in `write_credit: NAME`.
-        summary: what it does, in one line.
         plan: rule, steps of the writes, the episode's seed -> the counterfactuals that are played, in order.
         function: the episodes of one group -> advantages of the writes of each; `None`: as every other token.
         reads: settings that it reads.
@@ -97,14 +95,7 @@ class WriteCredit:
 
 @dataclass(frozen=True)
 class WriteRule:
-    """How writes are credited.
-
-    Args:
-        credit: a name in `WRITE_CREDITS`.
-        calls: patterns over `module/purpose` of the calls that write.
-        rerolls: re-rolls with, and as many without, each write that is looked at.
-        points: most writes of an episode that are looked at.
-    """
+    """How writes are credited: the fields `write_...` of `trainers.config.ScaffoldConfig`."""
 
     credit: str = "episode"
     calls: tuple[str, ...] = ("memory.*",)

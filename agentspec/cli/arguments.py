@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +20,42 @@ if TYPE_CHECKING:
 LABEL_CHARACTERS = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-+.() ")
 
 
+def at_least(lowest: int) -> Callable[[str], int]:
+    """A type of argument: whole numbers from `lowest` on."""
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
+        if number < lowest:
+            raise argparse.ArgumentTypeError(f"expected at least {lowest}, got {number}")
+        return number
+
+    return read
+
+
+def above(limit: float) -> Callable[[str], float]:
+    """A type of argument: finite numbers above `limit`."""
+
+    def read(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"expected a number, got {text!r}") from None
+        if not limit < number < math.inf:
+            raise argparse.ArgumentTypeError(f"expected a number above {limit:g}, got {text}")
+        return number
+
+    return read
+
+
 def add_environment(parser: argparse.ArgumentParser) -> None:
     """``--env`` and the options of the environment."""
     group = parser.add_argument_group("environment")
     group.add_argument("--env", default="deliverybench", help="registered name or gymnasium id (default: %(default)s)")
     group.add_argument("--map", metavar="DIR", help="folder of a city map (default: a generated city)")
-    group.add_argument("--shift-hours", type=float, metavar="H", help="length of the shift, in simulated hours")
+    group.add_argument("--shift-hours", type=above(0), metavar="H", help="length of the shift, in simulated hours")
     group.add_argument("--observation", metavar="NAME", help="compact, or another of the world's texts")
     group.add_argument("--action-mode", choices=("native", "menu"), help="write action calls, or choose from a menu")
     group.add_argument(
@@ -34,9 +65,13 @@ def add_environment(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="any other option of the environment; the value is YAML; may be repeated",
     )
-    group.add_argument("--max-steps", type=int, metavar="N", help="most steps of an episode")
+    group.add_argument("--max-steps", type=at_least(1), metavar="N", help="most steps of an episode")
     group.add_argument(
-        "--timeout", type=float, default=60.0, metavar="S", help="seconds per environment call (default: %(default)s)"
+        "--timeout",
+        type=above(0),
+        default=60.0,
+        metavar="S",
+        help="seconds per environment call (default: 60)",
     )
 
 

@@ -7,6 +7,8 @@ import json
 from dataclasses import asdict
 from typing import Any
 
+from agentspec.cli.arguments import at_least
+
 
 def add_parser(commands: Any) -> None:
     """Arguments of ``agentspec audit``."""
@@ -21,7 +23,7 @@ def add_parser(commands: Any) -> None:
         ),
     )
     parser.add_argument("run", metavar="RUN", help="folder of the run (its output_dir)")
-    parser.add_argument("--step", type=int, metavar="N", help="only the update of this optimiser step (default: all)")
+    parser.add_argument("--step", type=at_least(0), metavar="N", help="only the update of this step (default: all)")
     parser.add_argument(
         "--head", default="", metavar="DIGEST", help="head of the chain, as the run printed it when it ended"
     )

@@ -5,6 +5,7 @@ Shared by the command line and the recipes, so that a mistyped name reads the sa
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ OURS = ("agentspec", "trainers", "rewards", "eval", "recipes")
 """Packages whose `ValueError` is a check of the input; one that numpy or torch raises keeps its traceback."""
 
 EXPECTED = (SpecError, LLMError, yaml.YAMLError, FileNotFoundError, FileExistsError, NotADirectoryError)
-EXPECTED_OS = (IsADirectoryError, PermissionError)
+EXPECTED_OS = (IsADirectoryError, PermissionError, UnicodeDecodeError)
 
 EXTRAS = {
     "torch": "train",
@@ -36,6 +37,8 @@ EXTRAS = {
     "safetensors": "train",
     "gguf": "train",
     "matplotlib": "train",
+    "scipy": "eval",
+    "statsmodels": "eval",
     "httpx": "openai",
     "minigrid": "minigrid",
     "tensorboard": "tensorboard",
@@ -81,6 +84,8 @@ def one_line(error: BaseException | str) -> str:
         text = (
             f"this needs the package {package}, which is not installed; pip install '{DISTRIBUTION}[{EXTRAS[package]}]'"
         )
+    elif isinstance(error, UnicodeDecodeError):
+        text = f"a file that was given is no UTF-8 text ({error}); check the path"
     elif isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror or type(error).__name__}; check the path"
     elif isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
@@ -92,6 +97,17 @@ def one_line(error: BaseException | str) -> str:
     else:
         text = str(error) or type(error).__name__
     return " ".join(text.split())
+
+
+def require(*packages: str) -> None:
+    """Refuse to begin what would end without one of `packages`.
+
+    Raises:
+        ModuleNotFoundError: naming the first that is missing; `fail` says what installs it.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
 
 
 def _package(error: ModuleNotFoundError) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from agentspec.cli.arguments import (
     add_environment,
     add_model,
+    at_least,
     environment_options,
     key_values,
     labelled_spec,
@@ -19,6 +20,7 @@ from agentspec.cli.arguments import (
     parse_policy,
     parse_seeds,
 )
+from agentspec.cli.errors import require
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
@@ -59,9 +61,9 @@ def add_parser(commands: Any) -> None:
         metavar="SEEDS",
         help=f"task seeds such as 0-15 or 0,4,8 (default: {HELD_OUT}, held out from training)",
     )
-    group.add_argument("--rollouts", type=int, default=1, metavar="N", help="episodes per task")
-    group.add_argument("--seed", type=int, default=0, help="seed of the agents' own draws")
-    group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group.add_argument("--rollouts", type=at_least(1), default=1, metavar="N", help="episodes per task")
+    group.add_argument("--seed", type=at_least(0), default=0, metavar="N", help="seed of the agents' own draws")
+    group.add_argument("--concurrency", type=at_least(1), metavar="N", help="most episodes at once (default: all)")
     group.add_argument(
         "--start-memory",
         nargs="+",
@@ -81,7 +83,9 @@ def add_parser(commands: Any) -> None:
     )
     group = parser.add_argument_group("where it runs")
     group.add_argument("--executor", choices=("local", "ray"), help="this process (default), or workers through Ray")
-    group.add_argument("--workers", type=int, metavar="N", help="Ray: processes with one model each (default: 1)")
+    group.add_argument(
+        "--workers", type=at_least(1), metavar="N", help="Ray: processes with one model each (default: 1)"
+    )
     group.add_argument("--address", metavar="URL", help="Ray: address of a cluster (default: this machine)")
     group.add_argument("--dry-run", action="store_true", help="print what would be played, and play nothing")
     group = parser.add_argument_group("output")
@@ -104,6 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     from eval.store import Store
     from eval.tables import markdown, summarise, write_report
 
+    require("scipy", *(["matplotlib"] if arguments.plot else []))  # for the report at the end
     matrix = _matrix(arguments)
     given = {name: getattr(arguments, name) for name in ("out", "store", "executor", "workers", "address")}
     call = dict(matrix.arguments) | {name: value for name, value in given.items() if value is not None}

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import textwrap
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 from agentspec.registry import REGISTRY, CallProfile
 
+WIDTH = 116
 KINDS = ("env", "perception", "memory", "reasoning", "reflection", "reward")
 
 
@@ -17,7 +20,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "list", help="list environments, modules and rewards", description="All registered names, by kind."
     )
-    parser.add_argument("kind", nargs="?", choices=KINDS, help="only this kind")
+    parser.add_argument("kind", nargs="?", type=_kind, choices=KINDS, help="only this kind; plurals are fine")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(command=run)
 
@@ -30,12 +33,31 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(names, indent=2))
         return 0
-    for kind, entries in names.items():
-        print(kind)
-        for name, entry in entries.items():
-            notes = [note for note in (_calls(entry["calls"]), _needs(entry["needs"], entry.get("extra", ""))) if note]
-            print(f"  {name:<16} {entry['summary']}{' (' + '; '.join(notes) + ')' if notes else ''}")
+    print("\n".join(lines(names)))
     return 0
+
+
+def lines(names: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The registries as text: names in a column of their own, what is long goes on under itself."""
+    wide = max(map(len, (name for entries in names.values() for name in entries)), default=0)
+    found = []
+    for kind, entries in names.items():
+        found.append(kind)
+        for name, entry in entries.items():
+            notes = "; ".join(
+                note for note in (_calls(entry["calls"]), _needs(entry["needs"], entry.get("extra", ""))) if note
+            )
+            text = entry["summary"] + (f" ({notes})" if notes else "")
+            found += textwrap.wrap(
+                text, WIDTH, initial_indent=f"  {name:<{wide}}  ", subsequent_indent=" " * (wide + 4)
+            ) or [f"  {name}"]
+    return found
+
+
+def _kind(text: str) -> str:
+    """`memories` or `Memory` as `memory`."""
+    kind = text.lower()
+    return next((k for k in KINDS if kind in (k, f"{k}s", f"{k[:-1]}ies")), kind)
 
 
 def registered() -> dict[str, dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any, NoReturn
 
-from agentspec.cli import audit, compare, evaluate, export, listing, report, run, view
+from agentspec.cli import audit, compare, evaluate, export, listing, report, run, train, view
 from agentspec.cli.errors import PROGRAM, fail
 
 
@@ -22,10 +22,10 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of ``agentspec``; each command sets ``command`` to the function that runs it."""
-    parser = Parser(prog=PROGRAM, description="Embodied LLM agents as typed compositions: run, measure, export.")
+    parser = Parser(prog=PROGRAM, description="Embodied LLM agents as typed compositions: run, measure, train.")
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for module in (run, evaluate, report, compare, export, audit, listing, view):
+    for module in (run, evaluate, report, compare, train, export, audit, listing, view):
         module.add_parser(commands)
     for command in set(commands.choices.values()):
         command.add_argument(

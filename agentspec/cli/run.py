@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 from agentspec.cli.arguments import (
     add_environment,
     add_model,
+    at_least,
     environment_options,
     key_values,
     load_prices,
     parse_policy,
 )
-from agentspec.progress import episode_progress
+from agentspec.progress import episode_progress, load_policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory, write_trajectories
@@ -50,9 +51,9 @@ def add_parser(commands: Any) -> None:
     )
     add_model(parser)
     group = parser.add_argument_group("episodes")
-    group.add_argument("--seed", type=int, default=0, help="seed of the first episode's task (default: %(default)s)")
-    group.add_argument("--episodes", type=int, default=1, metavar="N", help="tasks with consecutive seeds")
-    group.add_argument("--concurrency", type=int, metavar="N", help="most episodes at once (default: all)")
+    group.add_argument("--seed", type=at_least(0), default=0, metavar="N", help="of the first task (default: 0)")
+    group.add_argument("--episodes", type=at_least(1), default=1, metavar="N", help="tasks with consecutive seeds")
+    group.add_argument("--concurrency", type=at_least(1), metavar="N", help="most episodes at once (default: all)")
     group.add_argument(
         "--start-memory", default="", metavar="FILE|DIR", help="start from a memory that a run left (scope: run)"
     )
@@ -72,33 +73,30 @@ def run(arguments: argparse.Namespace) -> int:
     from agentspec.carry import run_in_order, save_bank, start_bank
     from agentspec.cli.frames import Film
     from agentspec.episode import Job, Runner, environment_id, make_env
+    from agentspec.policies import check_agent
 
-    if arguments.episodes < 1:
-        raise SpecError(f"--episodes is {arguments.episodes}; expected at least 1")
     environment_id(arguments.env)  # a mistyped name is told before anything else
     policy, spec = agent(arguments)
-    if policy:
-        policy.check()
     options = environment_options(arguments)
     tasks = [Task(arguments.env, arguments.seed + i, options, "test") for i in range(arguments.episodes)]
     # The environment is made once more in its worker; here, an unknown name or a missing map is still a plain error.
-    make_env(tasks[0]).close()
+    env = make_env(tasks[0])
+    check_agent(policy, spec, env, arguments.env)
+    env.close()
     start = start_bank(arguments.start_memory, spec)
     film = Film(arguments.gif, tasks[0]) if arguments.gif else None
-    plays_model = policy is not None and not policy.scripted
-    if policy and plays_model and policy.settings()["backend"] == "local":
-        sys.stderr.write(f"loading {policy.name} ...\n")
+    prices = load_prices(arguments.prices)
     runner = Runner(
         spec,
-        policy.build() if policy else None,
+        load_policy(policy) if policy else None,
         make_env=film.make_env if film else make_env,
         concurrency=arguments.concurrency,
         timeout_s=arguments.timeout,
         max_steps=arguments.max_steps,
-        prices=load_prices(arguments.prices),
+        prices=prices,
         policy=policy.name if policy else spec.reasoning.name,
         on_done=None if arguments.json else _print_outcome,
-        on_step=_print_step if plays_model else None,
+        on_step=_print_step if policy and not policy.scripted else None,
         progress=episode_progress,
     )
     jobs = [Job(task) for task in tasks]

@@ -9,9 +9,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from agentspec.carry import KIND, read_bank
+from agentspec.cli.arguments import at_least
 from agentspec.cli.logs import holds_logs, view_logs
 from agentspec.files import write_atomic
-from agentspec.memory_text import data, diff, read_bank, text
+from agentspec.memory_text import data, diff, text
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Transition
@@ -28,7 +30,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("file", metavar="TRAJ.jsonl|DIR", nargs="?", help="trajectories, or a folder of Inspect logs")
     parser.add_argument("--bundle", metavar="DIR", default="", help="with a folder of logs: write a static site there")
-    parser.add_argument("--episode", type=int, default=0, metavar="N", help="which of them, from 0")
+    parser.add_argument("--episode", type=at_least(0), default=0, metavar="N", help="which of them, from 0")
     parser.add_argument("--steps", default="", metavar="A-B", help="only these steps")
     parser.add_argument("--full", action="store_true", help="observations and every model call as well")
     parser.add_argument("--memory", metavar="FILE", help="a memory file, or a run folder that holds one")
@@ -142,11 +144,36 @@ def _wrap(text: str, indent: str = "") -> list[str]:
 
 
 def _nth(path: Path, number: int) -> Trajectory:
-    found = next(islice(read_trajectories(path), max(0, number), None), None)
-    if found is None or number < 0:
+    _check_kind(path)
+    found = next(islice(read_trajectories(path), number, None), None)
+    if found is None:
         count = sum(1 for _ in read_trajectories(path))
         raise SpecError(f"{path} holds {count} episodes, numbered from 0; there is no episode {number}")
     return found
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse a file that holds no trajectories.
+
+    Raises:
+        SpecError: naming what it seems to be, and what this command reads.
+    """
+    line = b""
+    if not path.is_dir():
+        with open(path, "rb") as file:
+            line = file.readline(1 << 26)
+    try:
+        data = json.loads(line)
+        if isinstance(data, dict) and {"task", "steps"} <= data.keys():
+            return
+        memory = isinstance(data, dict) and data.get("kind") == KIND
+    except ValueError:
+        memory = False
+    hint = f"; it is a memory file: agentspec view --memory {path}" if memory else ""
+    raise SpecError(
+        f"{path} holds no trajectories{hint}; `view` reads the .jsonl that `agentspec run --out` and the folder "
+        "`trajectories/` of a run hold, and with --memory the memory file of a run"
+    )
 
 
 def _range(text: str) -> range:

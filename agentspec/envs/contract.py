@@ -66,6 +66,8 @@ INFO_KEYS: tuple[InfoKey, ...] = (
     InfoKey("events", (list, tuple), False, "names of what happened in the step, for rewards"),
     InfoKey("thought", (list, tuple), False, "calls and tokens that were charged to the step (see `deliberate`)"),
     InfoKey("balance", (int, float), False, "money or points held, for rewards by its change"),
+    InfoKey("goal_conditions", (int, float), False, "share of the goal conditions met, for rewards by its change"),
+    InfoKey("geodesic", Mapping, False, "metres on foot to the target: start, left, walked, shortest; for rewards"),
 )
 """The keys the scaffold reads; an environment may report more (JSON values), which trajectories keep."""
 

@@ -7,6 +7,7 @@ adapter of `agentspec.envs.generic`, which gives it text, a menu of its actions 
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from typing import Any
 import gymnasium
 
 from agentspec.actions import suggest
+from agentspec.parameters import check_types
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.types import Task
 
@@ -57,6 +59,7 @@ def make_env(task: Task) -> Any:
     from agentspec.envs.generic import adapted
 
     name = environment_id(task.env)
+    check_options(name, task.options)
     try:
         env = gymnasium.make(name, disable_env_checker=True, **task.options)
     except TypeError as error:
@@ -64,6 +67,24 @@ def make_env(task: Task) -> Any:
     except gymnasium.error.DependencyNotInstalled as error:
         raise SpecError(f"{name} needs a package that is not installed: {error}") from error
     return adapted(env, name)
+
+
+def check_options(name: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that nobody takes, and of our own environments those of another type.
+
+    Raises:
+        SpecError: with the nearest options there are.
+    """
+    made = environment_class(name)
+    if made is None:
+        return
+    accepted = inspect.signature(made).parameters
+    if all(p.kind is not p.VAR_KEYWORD for p in accepted.values()):
+        for key in options:
+            if key not in accepted and key not in inspect.signature(gymnasium.make).parameters:
+                raise SpecError(f"env {name!r} takes no option {key!r}{suggest(key, accepted)}")
+    if made.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        check_types(f"env {name!r}", made.__init__ if inspect.isclass(made) else made, options)
 
 
 def environment_class(name: str) -> Any:

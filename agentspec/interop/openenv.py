@@ -65,7 +65,8 @@ class World(Environment[TextAction, TextObservation, WorldState]):
         super().__init__()
         self._name = env
         self._game = Game(env, options)
-        self._seed, self._episode = 0, None
+        self._seed = 0
+        self._episode: str | None = None
 
     def reset(
         self,

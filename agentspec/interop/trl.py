@@ -10,9 +10,9 @@
         ...
     )
 
-Every action of the environment becomes a method with typed parameters and a docstring, from which TRL derives the tool's
-schema; `get_reward` is what TRL scores a rollout with. Stock TRL trains one growing conversation; scaffolds (memories,
-searches, debates) need this package's own trainer.
+Every action of the environment becomes a method with typed parameters and a docstring, from which TRL derives the
+tool's schema; `get_reward` is what TRL scores a rollout with. Stock TRL trains one growing conversation; scaffolds
+(memories, searches, debates) need this package's own trainer.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def environment_factory(env: str, options: Mapping[str, Any] | None = None, *, s
 def dataset(
     env: str, options: Mapping[str, Any] | None = None, *, count: int = 64, split: str = "train"
 ) -> list[dict[str, Any]]:
-    """Rows for `Dataset.from_list`: the instruction as system text, an empty user turn for the observation, the seed."""
+    """Rows for `Dataset.from_list`: instruction as system text, an empty user turn for what is observed, the seed."""
     game = Game(env, options)
     rows = []
     for task in make_tasks(env, dict(options or {}), count, split=split):

@@ -8,7 +8,7 @@ observation, reads each reply as an action and answers with the next observation
 in the seat. `ScaffoldHarness` sits there itself and plays the whole episode with one of this package's agents, every
 model call of which goes through verifiers' endpoint and is in its trace.
 
-Needs `pip install 'agentspec-rl[verifiers]'`. Plugins are found by the name of a top-level module: `agentspec_verifiers`.
+Needs `pip install 'agentspec-rl[verifiers]'`. Plugins are found by a top-level module's name: `agentspec_verifiers`.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ import os
 import re
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -104,8 +105,8 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     if (folder / "config.json").is_file():
         return ModelSource(str(folder), folder.resolve().name)
     if (folder / "adapter_config.json").is_file():
-        base = json.loads((folder / "adapter_config.json").read_text(encoding="utf-8")).get("base_model_name_or_path")
-        if not base:
+        base = base_of(name)
+        if base == name:
             raise ModelNotFoundError(
                 f"the adapter {folder} does not say which model it belongs to; give the base model as `model` and this "
                 "folder as `adapter`"
@@ -121,6 +122,35 @@ def resolve(name: str | os.PathLike[str], adapter: str | os.PathLike[str] | None
     return _hub(name)
 
 
+def check_name(name: str) -> None:
+    """Refuse a name that is no model here and cannot be one of the hub's; asks no network and converts nothing.
+
+    Raises:
+        ModelNotFoundError: as `resolve`.
+    """
+    bundled = BUNDLED.get(name.casefold())
+    if (bundled is None or bundled.find() is None) and not _HUB_ID.fullmatch(name):
+        resolve(name)
+
+
+def base_of(name: str) -> str:
+    """The model that ``name`` is, or, where it is the folder of an adapter, stands on."""
+    config = Path(name).expanduser() / "adapter_config.json"
+    if not config.is_file() or (config.parent / "config.json").is_file():
+        return name
+    return str(_adapter_config(config).get("base_model_name_or_path") or name)
+
+
+def _adapter_config(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        data = None
+    if not isinstance(data, dict):
+        raise ModelNotFoundError(f"{path} is malformed; give a folder written by `PeftModel.save_pretrained`")
+    return data
+
+
 def resolve_adapter(name: str | os.PathLike[str]) -> str:
     """A PEFT adapter: an existing folder, the name of one that ships, or a hub id (``owner/name``).
 
@@ -130,6 +160,7 @@ def resolve_adapter(name: str | os.PathLike[str]) -> str:
     name = os.fspath(name)
     folder = Path(name).expanduser()
     if (folder / "adapter_config.json").is_file():
+        _adapter_config(folder / "adapter_config.json")
         return str(folder)
     shipped = _shipped_adapters()
     if name in shipped:
@@ -259,9 +290,13 @@ def _verify(folder: Path) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without progress bars: converting takes seconds and says nothing of use."""
+    """Without progress bars while a model loads, and from then on without the deprecations between libraries.
+
+    Those come back at every checkpoint and with every adapter, and nobody who runs or trains could change anything.
+    """
     from transformers.utils import logging
 
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(transformers|trl|peft|accelerate|datasets)\b")
     shown: Any = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:

@@ -36,6 +36,13 @@ class Prices:
         data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
             raise ValueError(f"{path}: expected a mapping of model name to {{input, output, cached}} in $ per million")
+        for name, value in data.items():
+            unknown = [key for key in value if key not in Price.__dataclass_fields__]
+            given = [v for key, v in value.items() if (key, v) != ("cached", None)]
+            if unknown or not all(isinstance(v, int | float) and v >= 0 for v in given):
+                raise ValueError(
+                    f"{path}: {name} is {value}; expected input, output and cached in $ per million tokens"
+                )
         return cls({str(name): Price(**value) for name, value in data.items()})
 
     def cost(self, model: str, usage: Usage) -> float:

@@ -31,6 +31,12 @@ class Budget:
     tokens: int | None = None
     cost: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("calls", "tokens", "cost"):
+            limit = getattr(self, name)
+            if limit is not None and not limit >= 0:  # NaN too
+                raise ValueError(f"{name} is {limit}; expected a number of at least 0, or null (unlimited)")
+
     def check(self, calls: int, tokens: int, cost: float) -> None:
         """Raise :class:`BudgetExceededError` if one more call may not be made."""
         for name, limit, used in (

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, Literal
 
 from agentspec.llm.base import LLMError, Message, Request, require_context
 from agentspec.llm.constrain import ChoiceTrie
@@ -60,7 +60,7 @@ class VisionLLM:
         cls,
         name_or_path: str | PathLike[str],
         *,
-        dtype: str = "auto",
+        dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto",
         device: str = "auto",
         name: str | None = None,
         **kwargs: Any,

@@ -21,7 +21,7 @@ from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, brief, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, goal_of, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -39,7 +39,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 TYPES = ("semantic", "episodic", "procedural")
 UNCHANGED = "NO_CHANGE"
 EDITS = 4
-TASK_TOKENS = 64
 
 HEAD = "You manage the memory of an agent that acts in an environment.\n\nTask: {task}\n\n" + DATA + "\n{steps}"
 SEMANTIC = (
@@ -188,7 +187,7 @@ class LangMem:
         name = step_name(now.episode, transition.step, now)
         self._steps.append(f"{name}: {step_text(transition, self.state_tokens, count)}")
         self._for_facts, self._for_episode = self._for_facts + 1, self._for_episode + 1
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         if not (transition.terminated or transition.truncated):
             whole = bool(self.episode_every) and self._for_episode >= self.episode_every
             await self._write(facts=self._for_facts >= self.every, whole=whole)

@@ -30,6 +30,7 @@ from agentspec.memory.parts.steps import (
     brief,
     distinct,
     first_held,
+    goal_of,
     newest_within,
     outcome,
     step_name,
@@ -51,7 +52,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"every": 10, "overview_every": 5, "answer_tokens": 256, "steps_tokens": 1600},
     "rl": {"every": 16, "overview_every": 0, "answer_tokens": 128, "steps_tokens": 768},
 }
-TASK_TOKENS = 64
 NEXT_EPISODE = "[Plan for the next episode]"
 
 HEAD = (
@@ -220,7 +220,7 @@ class MemoryBank:
         text = step_text(transition, self.state_tokens, self.services.llm.count_tokens)
         self._add("raw", text, transition.step)
         self._held_from = first_held(self.services, transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, self.services.llm.count_tokens)
+        self._task = goal_of(transition.input.instruction, self.services.llm.count_tokens)
         ended = transition.terminated or transition.truncated
         if not ended and transition.step + 1 - self._day_began >= self.every:
             await self._close_day(transition.step + 1)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, brief, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import DATA, brief, goal_of, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
@@ -45,7 +45,6 @@ STORES: dict[str, tuple[str, tuple[str, ...]]] = {
 SEARCHED = tuple(name for name in STORES if name != "core")
 REWRITE_AT = 0.9
 RELATED = 3
-TASK_TOKENS = 64
 
 HEAD = (
     "You manage the memory of an agent that acts in an environment. Its stores: "
@@ -210,7 +209,7 @@ class Mirix:
         name = step_name(self.services.time().episode, transition.step, self.services.time())
         self._steps.append(f"{name}: {step_text(transition, self.state_tokens, count)}")
         self._pending += 1
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         ended = transition.terminated or transition.truncated
         if not ended and self._pending >= self.every:
             await self._flush()
@@ -312,7 +311,7 @@ class Mirix:
         """What to search for: the model's topic, or the observation where it names none."""
         count = self.services.llm.count_tokens
         prompt = TOPIC.format(
-            task=clip_text(input.instruction, TASK_TOKENS, count),
+            task=goal_of(input.instruction, count),
             state=excerpt(input.text, self.steps_tokens // 4, count),
         )
         answer = await self.services.ask("topic", prompt, 64, json_of({"topic": str}))

@@ -1,7 +1,7 @@
 """What memories are built on: find by meaning, by words, by both, and along a small graph.
 
 - `VectorIndex`: cosine similarity over a NumPy matrix, exact, ties in order of insertion.
-- `Lexical`: BM25 over SQLite's FTS5, in memory.
+- `Lexical`: BM25 with FTS5's words and scores, over postings in memory.
 - `reciprocal_rank_fusion`, `weighted_fusion`: one ranking out of several.
 - `Graph`: adjacency, components, label propagation, ego-splitting, neighbourhoods.
 

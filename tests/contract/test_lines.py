@@ -43,6 +43,7 @@ def test_the_contract_reaches_the_method(module: str) -> None:
                 played = play(case, scripts(case)[model], menu=menu, layout=layout, length=LENGTH)
                 tested = played.module(case)
                 tested.restore(tested.snapshot())
+                getattr(tested, "describe", str)()
                 if model == "example":
                     carried = played.agent.carry()
                     played = play(case, example(case), menu=menu, layout=layout, length=LENGTH, carried=carried)

@@ -165,7 +165,7 @@ def test_malformed_answers_change_nothing_and_the_review_waits() -> None:
     assert memory.playbook.state() == before == joined([])
     learn(memory, step(2, "s2"))
     assert script.prompt().count("- Insight: Look first.") == 2  # the review whose curation failed, and the new one
-    assert memory.playbook.state() == []
+    assert memory.playbook.state() == joined([])
     assert dict(memory.services.llm.recorder.problems) == {("memory.m", "malformed"): 2, ("memory.m", "rejected"): 1}
 
 

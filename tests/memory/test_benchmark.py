@@ -10,14 +10,16 @@ from typing import Any
 import pytest
 
 from agentspec.registry import REGISTRY
-from benchmarks.memory import REPEATS, Filled, Script, Stopwatch, main, methods, with_growth
+from benchmarks.memory import REPEATS, SNAPSHOTS, Filled, Script, Stopwatch, main, methods, with_growth
 from tests.fixtures import trial_memories
 
 
 def test_figures_have_the_keys_that_are_promised(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--json", "--sizes", "20", "40", "--methods", "base"]) == 0
     rows = json.loads(capsys.readouterr().out)["base"]
-    assert list(rows) == ["20", "40"] and rows["40"]["filled"] == 20 + REPEATS  # those of 20 were more already
+    assert (
+        list(rows) == ["20", "40"] and rows["40"]["filled"] == 20 + REPEATS + SNAPSHOTS
+    )  # those of 20 were more already
     assert {"retrieve_p50_ms", "store_p50_ms", "snapshot_ms", "restore_ms", "bytes_per_entry"} <= set(rows["20"])
 
 

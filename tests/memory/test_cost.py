@@ -99,7 +99,7 @@ def test_the_sentence_follows_from_the_method_s_own_calls(tmp_path: Path) -> Non
     few = said(row(120.0, 0.1, 100.0, preset="rl"), tmp_path)
     assert "1.30 of base, less than the paper's 2.00 to 4.00" in few
     assert "70 are missing here: 0.70 more calls a step of this size (it makes 0.10)" in few
-    assert "Preset `rl` sets `every` 6 (`paper`: 1), `top` 4 (`paper`: 10)" in few
+    assert "Preset `rl` sets `every` 6 (`paper`: 1), `top` 2 (`paper`: 10)" in few
     none = said(row(150.0), tmp_path)
     assert "memory asks the model nothing" in none and "50 tokens a step are missing here." in none
 

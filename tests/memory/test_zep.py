@@ -13,6 +13,7 @@ from agentspec.memory.zep.temporal import TemporalGraph, holds
 from agentspec.registry import SpecError
 from agentspec.retrieval import Graph, label_propagation
 from agentspec.services import Time
+from agentspec.state import dump_state, load_state
 from tests.memory.bench import Bench, observation
 from tests.memory.recall_world import notes, succeeds
 
@@ -205,6 +206,36 @@ def test_communities_that_changed_are_summed_up_between_episodes() -> None:
     assert bench.purposes().count("community") == 1  # nothing has changed
     assert "- The mill is near the port. [since episode 1, step 1]" in bench.prompt("community")
     assert bench.memory.metrics()["communities"] == 1
+
+
+def test_a_fact_that_is_told_again_is_so_since_it_was_first() -> None:
+    bench = Bench(NAME, {"extract": facts(CLOSED)}, scope="run")
+    for number in range(3):
+        for _ in range(2):
+            bench.step("a door")
+        since = "episode 1, step 1" if number else "step 1"
+        assert f"The door is closed. [since {since}]" in bench.shown("door")
+        bench.end()
+
+
+def test_what_has_gone_leaves_the_graph_as_if_it_had_never_been() -> None:
+    graph, kept = TemporalGraph(HashEmbedder(), 3), TemporalGraph(HashEmbedder(), 3)
+    told = [(1, 2), (1, 3), (1, 2), (4, 5), (1, 3)]
+    for i, (subject, target) in enumerate(told):
+        for made in (graph, kept) if i >= 2 else (graph,):
+            for id in (subject, target):
+                if id not in made.names:
+                    made.add_entity(id, f"thing {id}")
+            made.add_fact(10 + i, f"fact {i}", Time(0, i, i), (subject, "near", target), i)
+    assert sorted(graph.names) == sorted(kept.names) == [1, 2, 3, 4, 5]
+    for id in kept.names:
+        assert set(graph.graph.neighbours(id)) == set(kept.graph.neighbours(id))
+        assert [e.id for e in graph.of((id,))] == [e.id for e in kept.of((id,))]
+    graph.remove_fact(13)
+    assert sorted(graph.names) == [1, 2, 3] and graph.entity("thing 4") is None and not graph.alike("thing 4", 3, 0.1)
+    again = TemporalGraph(HashEmbedder(), 3)
+    again.load(load_state(dump_state([graph.state()]))[0])
+    assert again.state() == graph.state() and list(again.graph.edges()) == list(graph.graph.edges())
 
 
 def test_facts_out_of_the_structured_state_need_no_call() -> None:

@@ -34,9 +34,11 @@ def test_values_and_gradients_are_those_of_peft(config: dict[str, Any]) -> None:
         if name.endswith("bias"):
             torch.nn.init.normal_(parameter)
     theirs, ours = update(model, merged=False), update(model, merged=True)
+    exact = update(model.double(), merged=False)
     assert len(theirs) == len(ours) == 1 + 2 * 2 * 7
-    for a, b in zip(theirs, ours, strict=True):
-        assert float((a - b).norm()) <= 1e-5 * float(a.norm())
+    for peft, merged, truth in zip(theirs, ours, exact, strict=True):
+        of_peft, of_ours = (float((g - truth).norm() / truth.norm()) for g in (peft, merged))
+        assert of_ours <= max(1e-5, 3 * of_peft)  # as exact as PEFT's, where a gradient is small by cancellation too
 
 
 def test_layers_are_themselves_again() -> None:

@@ -116,6 +116,8 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         _check("render_mode", render_mode, (None, "rgb_array"))
         if isinstance(order_seed, str):
             _check("order_seed", order_seed, ("seed", "original"))
+        if not 0 < shift_hours < float("inf"):
+            raise ValueError(f"shift_hours is {shift_hours}; expected a number above 0")
         if max_steps is not None and not 1 <= max_steps <= STEP_LIMIT:
             raise ValueError(f"max_steps is {max_steps}; expected 1 to {STEP_LIMIT}, or None")
         self._arguments = {

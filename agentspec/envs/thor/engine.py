@@ -178,8 +178,13 @@ class OfflineThor:
 
     def distance(self, target: str) -> float | None:
         """Metres on foot to where an object (id or type) is seen; None if there is no way."""
-        agent = self.state.agent
-        return self._way(target)[0].get(cell_at(agent.x, agent.z))
+        best, (x, z) = self._way(target)[0], (self.state.agent.x, self.state.agent.z)
+        i, j = cell_at(x, z)
+        if (i * GRID, j * GRID) == (x, z):
+            return best.get((i, j))
+        # Between cells: by way of the nearest ones, so that nobody comes nearer by more than was walked.
+        near = [(i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (i + a, j + b) in best]
+        return min((best[c] + math.dist((x, z), (c[0] * GRID, c[1] * GRID)) for c in near), default=None)
 
     def _way(self, wanted: str) -> tuple[dict[Cell, float], dict[Cell, Cell]]:
         """`geodesic.distances` to where an object is seen; searched once until an object changes."""

@@ -1,8 +1,10 @@
 """What the agent sees, drawn with Pillow: boxes in their type's colour, shaded by the side, nearest last.
 
 A painter's algorithm over the faces of all boxes: faces that look away are dropped, faces that reach behind the camera
-are cut at a near plane, the rest is projected and filled from far to near. Long walls and floors are drawn first. It is
-a picture of where things are, not of what they look like.
+are cut at a near plane, the rest is projected and filled, box by box, none before one that it may hide (two boxes that
+do not meet are parted by a plane along an axis, which tells). Walls are painted in pieces, so that no three boxes hide
+each other in a ring. Of a container that is open the far sides are drawn, so that one sees what is in it. It is a
+picture of where things are, not of what they look like.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from agentspec.envs.thor.protocol import Picture
-from agentspec.envs.thor.scene import Scene
+from agentspec.envs.thor.scene import Scene, Vector
 from agentspec.envs.thor.state import State
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
+Box = tuple[Floats, Floats, Colour]
+"""Centre and size in metres, and a colour."""
 
 NEAR = 0.05
 """Metres before the camera at which faces are cut."""
@@ -69,21 +73,33 @@ def draw(scene: Scene, state: State, settings: Settings) -> Picture:
     eye, turn = settings.camera.eye(state.agent), settings.camera.turn(state.agent)
     focal = settings.height / 2 / settings.camera.half
     _floor(canvas, scene, eye, turn, focal, size)
-    walls = [(np.array(c), np.array(s), WALLS) for c, s in scene.walls]
+    walls = [(c, s, WALLS) for c, s in pieces(scene.walls)]
     shut = {b.id for b in state.bodies.values() if b.closed or b.held}
-    boxes = [
-        (np.array(b.centre), np.array(b.size), _colour(b.type, b.on))
-        for b in state.bodies.values()
-        if not b.held and b.type != "Floor" and not any(p in shut for p in b.parents)
+    shown = [
+        b for b in state.bodies.values() if not b.held and b.type != "Floor" and not any(p in shut for p in b.parents)
     ]
-    for layer in (walls, boxes) if _one_room(scene) else (walls + boxes,):
-        for polygon, colour in _faces(layer, eye, turn, focal, size):
-            canvas.polygon(polygon, fill=colour, outline=_dark(colour))
+    boxes = [(np.array(b.centre), np.array(b.size), _colour(b.type, b.on)) for b in shown]
+    number = {b.id: len(walls) + i for i, b in enumerate(shown)}
+    hollow = [number[b.id] for b in shown if b.open and {"openable", "receptacle"} <= set(b.abilities)]
+    inside = [(number[b.id], number[p]) for b in shown for p in b.parents if number.get(p) in hollow]
+    for polygon, colour, line in _faces(walls + boxes, hollow, inside, eye, turn, focal, size):
+        canvas.polygon(polygon, fill=colour, outline=line)
     return np.asarray(image)
 
 
-def _one_room(scene: Scene) -> bool:
-    return len(scene.walls) <= 4
+@lru_cache(maxsize=64)
+def pieces(walls: tuple[tuple[Vector, Vector], ...]) -> tuple[tuple[Floats, Floats], ...]:
+    """Walls as centres and sizes of pieces about 1 m long."""
+    made = []
+    for c, s in walls:
+        axis = 0 if s[0] >= s[2] else 2
+        count = max(1, round(s[axis]))
+        for i in range(count):
+            centre, length = np.array(c), np.array(s)
+            centre[axis] += s[axis] * ((i + 0.5) / count - 0.5)
+            length[axis] = s[axis] / count
+            made.append((centre, length))
+    return tuple(made)
 
 
 def _colour(type_name: str, on: bool) -> Colour:
@@ -96,9 +112,24 @@ def _dark(colour: Colour) -> Colour:
 
 
 def _faces(
-    boxes: list[tuple[Floats, Floats, Colour]], eye: Floats, turn: Floats, focal: float, size: tuple[int, int]
-) -> list[tuple[list[tuple[float, float]], Colour]]:
-    """Polygons in pixels with their colours, far to near."""
+    boxes: list[Box],
+    hollow: list[int],
+    inside: list[tuple[int, int]],
+    eye: Floats,
+    turn: Floats,
+    focal: float,
+    size: tuple[int, int],
+) -> list[tuple[list[tuple[float, float]], Colour, Colour]]:
+    """Polygons in pixels with their colours and those of their outlines, far to near.
+
+    Args:
+        boxes: all of them.
+        hollow: numbers of those that are open.
+        inside: (number of a box, number of the open one that it is in).
+        eye, turn: of the camera.
+        focal: its focal length, pixels.
+        size: of the picture.
+    """
     if not boxes:
         return []
     centres, sizes = np.array([b[0] for b in boxes]), np.array([b[1] for b in boxes])
@@ -106,20 +137,69 @@ def _faces(
     local = (corners - eye) @ turn.T
     middles = centres[:, None] + _NORMALS / 2 * sizes[:, None]
     facing = ((eye - middles) * _NORMALS).sum(-1) > 0
+    facing[hollow] = ~facing[hollow]
     facing &= (local[..., 2].max(axis=1) > NEAR)[:, None]
     # the point of a box nearest to the camera decides which box is in front; within a box, the face's middle
     nearest = np.linalg.norm(np.clip(eye, centres - sizes / 2, centres + sizes / 2) - eye, axis=1)
     spans = np.linalg.norm(centres - eye, axis=1)
+    rank = _in_front(0.5 * nearest + 0.5 * spans, centres, sizes, hollow, inside)
+    shown = np.flatnonzero(facing.any(axis=1) & _in_picture(local, focal, size))
+    far = np.linalg.norm(middles - eye, axis=2)
     found = []
-    for i, f in zip(*np.nonzero(facing), strict=True):
-        polygon = _project(local[i, _FACES[f]], focal, size)
-        if polygon:
-            r, g, b = boxes[i][2]
-            s = _SHADE[f]
-            far = float(np.linalg.norm(middles[i, f] - eye))
-            found.append((0.5 * nearest[i] + 0.5 * spans[i], far, polygon, (int(r * s), int(g * s), int(b * s))))
-    found.sort(key=lambda row: (-row[0], -row[1]))
-    return [(polygon, colour) for _, _, polygon, colour in found]
+    for i in shown[_order(centres[shown], sizes[shown], eye, rank[shown])]:
+        for f in sorted(np.flatnonzero(facing[i]), key=lambda f: -far[i, f]):
+            polygon = _project(local[i, _FACES[f]], focal, size)
+            if polygon:
+                r, g, b = boxes[i][2]
+                s = _SHADE[f]
+                colour = (int(r * s), int(g * s), int(b * s))
+                # the seams between pieces of a wall are not drawn
+                line = colour if boxes[i][2] == WALLS else _dark(colour)
+                found.append((polygon, colour, line))
+    return found
+
+
+def _in_picture(local: Floats, focal: float, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Which boxes are not wholly to one side of the picture; `local` are corners in camera coordinates, (n, 8, 3)."""
+    ahead = np.maximum(local[..., 2], 0.0)
+    wide, high = ahead * size[0] / 2 / focal, ahead * size[1] / 2 / focal
+    beside = (local[..., 0] > wide).all(1) | (local[..., 0] < -wide).all(1)
+    return ~(beside | (local[..., 1] > high).all(1) | (local[..., 1] < -high).all(1))
+
+
+def _order(centres: Floats, sizes: Floats, eye: Floats, rank: Floats) -> list[int]:
+    """The numbers of boxes so that none comes before one that it may hide; by `rank`, large first, where that is open.
+
+    A box cannot hide another one from which a plane along an axis parts it, if the eye is not on its own side of it.
+    """
+    low, high = centres - sizes / 2, centres + sizes / 2
+    above = (low[:, None] >= high[None] - 0.01) & (eye <= low + 0.01)[:, None]
+    below = (high[:, None] <= low[None] + 0.01) & (eye >= high - 0.01)[:, None]
+    harmless = (above | below).any(axis=2)  # [i, j]: i cannot hide j
+    first = harmless & ~harmless.T
+    waiting = first.sum(axis=0)
+    left = np.ones(len(rank), bool)
+    order = []
+    for _ in range(len(rank)):
+        free = left & (waiting == 0)
+        best = int(np.argmax(np.where(free if free.any() else left, rank, -np.inf)))
+        order.append(best)
+        left[best] = False
+        waiting -= first[best]
+    return order
+
+
+def _in_front(rank: Floats, centres: Floats, sizes: Floats, hollow: list[int], inside: list[tuple[int, int]]) -> Floats:
+    """Ranks (larger is painted earlier) with open containers after the furniture they are part of, and before what they
+    hold."""
+    held = {i for i, _ in inside}
+    for k in hollow:
+        meets = (np.abs(centres - centres[k]) <= (sizes + sizes[k]) / 2 + 0.02).all(axis=1)
+        meets[[k, *held]] = False
+        rank[k] = min(rank[k], rank[meets].min(initial=np.inf)) - 1e-3
+    for i, k in inside:
+        rank[i] = min(rank[i], rank[k] - 1e-3)
+    return rank
 
 
 def _project(points: Floats, focal: float, size: tuple[int, int]) -> list[tuple[float, float]]:

@@ -14,19 +14,20 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from os import PathLike
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from agentspec.llm.base import LLMError, Message, Request, require_context
 from agentspec.llm.batching import Batcher, Batching
 from agentspec.llm.chat import ChatFormat
 from agentspec.llm.constrain import ChoiceTrie
 from agentspec.llm.local.adapters import UNTAGGED, adapter_for, check_adapters
-from agentspec.llm.local.engine import Engine
-from agentspec.llm.local.forward import PackedModel
-from agentspec.llm.local.rows import Job
-from agentspec.llm.local.states import StateRecorder
 from agentspec.llm.models import quiet, resolve
 from agentspec.types import LLMCall, Sampling, Usage
+
+if TYPE_CHECKING:
+    from agentspec.llm.local.engine import Watch
+    from agentspec.llm.local.rows import Job
+    from agentspec.llm.local.states import StateRecorder
 
 
 class LocalLLM:
@@ -72,6 +73,9 @@ class LocalLLM:
         adapters: Mapping[str, str] | None = None,
         batching: Batching | Literal["auto"] = "auto",
     ) -> None:
+        from agentspec.llm.local.engine import Engine  # torch; asking what this class takes needs none
+        from agentspec.llm.local.forward import PackedModel
+
         self.name = name
         self.model = model
         self.tokenizer = tokenizer
@@ -101,7 +105,7 @@ class LocalLLM:
         name_or_path: str | PathLike[str],
         adapter: str | PathLike[str] | None = None,
         *,
-        dtype: str = "auto",
+        dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto",
         device: str = "auto",
         name: str | None = None,
         **kwargs: Any,
@@ -144,6 +148,8 @@ class LocalLLM:
 
     async def generate(self, request: Request) -> LLMCall:
         """Sample `request.sampling.n` completions (see `agentspec.llm.base.LLM`)."""
+        from agentspec.llm.local.rows import Job
+
         began = time.perf_counter()
         sampling = request.sampling
         prompt = self.chat.render(request.messages)
@@ -163,6 +169,8 @@ class LocalLLM:
 
         A scoring carries no tag: of `adapters`, only a pattern that matches everything routes it.
         """
+        from agentspec.llm.local.rows import Job
+
         if not continuations:
             return ()
         prompt = self.chat.render(messages)
@@ -171,6 +179,10 @@ class LocalLLM:
         job = Job(episode, prompt, Sampling(), continuations=encoded, adapter=adapter_for(UNTAGGED, self.adapters))
         await self._submit(-1, job)
         return job.scores
+
+    def watch(self, watch: Watch | None) -> None:
+        """Tell `watch` before every forward how far the batch is (see `agentspec.progress.model_progress`)."""
+        self._engine.watch = watch
 
     def count_tokens(self, text: str) -> int:
         """Number of tokens of `text`."""
@@ -194,6 +206,8 @@ class LocalLLM:
 
     def record_states(self, layer: Any) -> StateRecorder:
         """From now on, what goes into a decoder `layer` of the model is recorded."""
+        from agentspec.llm.local.states import StateRecorder
+
         self._engine.model.recorder = recorder = StateRecorder(layer)
         return recorder
 

@@ -30,6 +30,9 @@ from agentspec.tokens import shared_prefix
 Exchange = Callable[[Sequence[Job]], Sequence[Job]]
 """Jobs that are done -> jobs that join."""
 
+Watch = Callable[[int, int], None]
+"""Told before a forward, of the rows that run: tokens of their prompts still to be read, tokens written so far."""
+
 _TOKENS_PER_FORWARD = {"cpu": 512}
 _DEFAULT_TOKENS = 8192
 
@@ -60,6 +63,7 @@ class Engine:
         self._decode = decode
         self._max_batch = max_batch
         self._weights: tuple[int, int] | None = None
+        self.watch: Watch | None = None
 
     def run(self, jobs: Sequence[Job], exchange: Exchange = lambda done: ()) -> None:
         """Fill in ``completions`` or ``scores``, and ``cached``, of every job.
@@ -88,6 +92,10 @@ class Engine:
             while scheduler.rows and scheduler.adapter == adapter:
                 running = list(scheduler.running)
                 self._place(scheduler.admit(), running)
+                if self.watch:
+                    prompts = [(len(row.job.prompt), row) for row in scheduler.running]
+                    reading = sum(max(0, n - row.computed) for n, row in prompts)
+                    self.watch(reading, sum(len(row.tokens) - n for n, row in prompts))
                 self._advance(schedule(scheduler.running, budget))
                 for row in scheduler.running:
                     if row.done:

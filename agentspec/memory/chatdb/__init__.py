@@ -24,7 +24,7 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.chatdb.database import TABLES, Database, plain
-from agentspec.memory.parts.steps import FEEDBACK_TOKENS, IN, brief, first_held, step_name
+from agentspec.memory.parts.steps import FEEDBACK_TOKENS, IN, brief, first_held, goal_of, step_name
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
@@ -52,7 +52,6 @@ FILL = (
     "\n\nResults so far:\n{results}\n\nNext step: {about}\nSQL: {sql}\nWrite this statement with every <placeholder> "
     'replaced by what the results say. Answer with JSON:\n{{"sql": the statement}}'
 )
-TASK_TOKENS = 64
 PLACEHOLDER = re.compile(r"<[A-Za-z_][\w .-]*>")
 
 
@@ -195,7 +194,7 @@ class ChatDB:
         return PLAN.format(
             most=self.most_steps,
             rows=self.row_limit,
-            task=clip_text(input.instruction, TASK_TOKENS, count),
+            task=goal_of(input.instruction, count),
             rows_now=self.db.rows("SELECT count(*) FROM steps")[0][0],
             episode=newest[0],
             step=newest[1],

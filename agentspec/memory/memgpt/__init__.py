@@ -25,7 +25,7 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, distinct, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import brief, goal_of, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -44,7 +44,6 @@ BLOCKS = ("task", "strategy")
 PAGE = 5
 WARN, DOWN_TO, KEEP = 0.75, 0.75, 3
 MOST_CALLS = 4
-TASK_TOKENS = 64
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ class MemGPT:
     async def store(self, transition: Transition) -> None:
         count = self.services.llm.count_tokens
         self._record(step_text(transition, self.state_tokens, count), transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         if transition.terminated or transition.truncated:
             return
         share = self._used() / self.capacity if self.capacity else 0.0
@@ -273,8 +272,7 @@ class MemGPT:
 
     def _recall_search(self, call: FunctionCall) -> str:
         page = max(0, call.page)
-        hits = self._words.search(call.query, 2 * PAGE * (page + 1))
-        hits = distinct(hits, lambda key: self.recall[key].text)
+        hits = self._words.search(call.query, PAGE * (page + 1))
         return self._page([self._named(self.recall[key]) for key, _ in hits], page)
 
     def _page(self, texts: list[str], page: int) -> str:

@@ -7,9 +7,10 @@ what must not be lost. Between episodes, *dreaming* moves into `MEMORY.md` what 
 
 AgentSpec's form: procedural memory of lessons, refined along the trajectory. Every `every` steps one call edits rules
 and skills by name (edits are applied by code; what they do not name stays as it is). Skill and log entries are chosen
-by similarity to the observation, without a call. The workspace is virtual, a mapping of paths to text, and can be
-written to disk (`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of
-4,000 tokens of a window of 200,000 are shares of the model's window.
+by similarity to the observation, without a call; of the log at most a third of what there is to choose from, so that a
+short episode is not shown whole. The workspace is virtual, a mapping of paths to text, and can be written to disk
+(`files().export(folder)`). A *day* of OpenClaw is an episode; its reserve of 20,000 and soft margin of 4,000 tokens of
+a window of 200,000 are shares of the model's window.
 
 Cost per step: none to retrieve; 1 call per `every` steps; 1 per cut of the conversation; at most 2 at an episode's end,
 and only where a later episode starts from this one's memory. `preset: paper` stands for ReAct + OpenClaw in its tables.
@@ -30,6 +31,7 @@ from agentspec.memory.parts.steps import (
     brief,
     distinct,
     first_held,
+    goal_of,
     newest_within,
     outcome,
     step_name,
@@ -49,7 +51,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"every": 2, "search": 6, "answer_tokens": 320, "steps_tokens": 768},
     "rl": {"every": 8, "search": 3, "answer_tokens": 192, "steps_tokens": 640},
 }
-TASK_TOKENS = 64
 TURN_TOKENS = 96
 NOTES = 6
 EDITS = 3
@@ -220,7 +221,7 @@ class OpenClaw:
         count = self.services.llm.count_tokens
         self._append(step_text(transition, self.state_tokens, count), transition.step)
         self._held_from = first_held(self.services, transition.step)
-        self._task = clip_text(transition.input.instruction, TASK_TOKENS, count)
+        self._task = goal_of(transition.input.instruction, count)
         if transition.terminated or transition.truncated:
             return
         if transition.step + 1 - self._since >= self.every:

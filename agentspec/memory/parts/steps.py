@@ -17,6 +17,9 @@ from agentspec.types import Experience, Transition
 FEEDBACK_TOKENS = 64
 """Most tokens kept of what the environment said about an action."""
 
+TASK_TOKENS = 64
+"""Most tokens of what a task is about."""
+
 IN = " | in: "
 """Stands between what a step did and the state it was taken in."""
 
@@ -58,11 +61,18 @@ def step_name(episode: int, step: int, now: Time) -> str:
 def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) -> list[str]:
     """The newest texts that fit into `tokens`, in order, with a line that says how many older ones do not.
 
-    Of a single text that is too long the beginning is kept.
+    Before a step is left out, the states of all are shortened. Of a single text that is too long the beginning is kept.
     """
+    if sum(count_tokens(text) + 1 for text in texts) > tokens:
+        texts = [brief(text, count_tokens) for text in texts]
     kept = newest_that_fit(texts, tokens, count_tokens)
     gone = len(texts) - len(kept)
     return ([f"({gone} earlier steps are left out)"] if gone else []) + kept
+
+
+def goal_of(instruction: str, count_tokens: CountTokens) -> str:
+    """What a task is about: the first paragraph of its instruction, clipped."""
+    return clip_text(instruction.strip().partition("\n\n")[0], TASK_TOKENS, count_tokens)
 
 
 def first_held(services: Services, step: int) -> int:

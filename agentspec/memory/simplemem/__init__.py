@@ -30,7 +30,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
@@ -48,7 +47,7 @@ from agentspec.memory.parts.entries import (
     task_of,
     told,
 )
-from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, Note
+from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, WORD, Note, data_of
 from agentspec.parameters import at_least, settings
 from agentspec.services import Services
 from agentspec.state import dump_state, joined, load_state
@@ -86,7 +85,6 @@ SEMANTIC, LEXICAL, STRUCTURED = 25, 5, 5
 MOST_QUERIES, MOST_CHECKS = 4, 2
 
 _NAME = re.compile(r"\b(?:[A-Z][\w-]*|\w*\d[\w.]*)\b")
-_WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
 _VAGUE = re.compile(
     r"\b(he|she|it|they|him|her|them|this|these|those|now|today|yesterday|tomorrow|later|soon|recently|ago)\b", re.I
 )
@@ -186,13 +184,8 @@ class SimpleMemory:
             chosen[name] for name in ("step_tokens", "answer_tokens", "task_tokens", "repairs")
         )
         self.gate, self.weight = gate, weight
-        self.consolidate, self.affinity, self.beta, self.decay, self.cluster = (
-            consolidate,
-            affinity,
-            beta,
-            decay,
-            cluster,
-        )
+        self.consolidate, self.affinity, self.beta = consolidate, affinity, beta
+        self.decay, self.cluster = decay, cluster
         self.depth, self.words_weight, self.match_weight, self.plan = depth, words_weight, match_weight, plan
         self.capacity, self.recent = capacity, recent
         self.entries = Entries(embedder_of(services), capacity, words=True)
@@ -251,7 +244,7 @@ class SimpleMemory:
 
     def _naming(self, query: str) -> list[int]:
         """Notes with a place or entity that the query names."""
-        words = [w.casefold() for w in _WORD.findall(query)]
+        words = [w.casefold() for w in WORD.findall(query)]
         phrases = dict.fromkeys(" ".join(words[i : i + n]) for n in (3, 2, 1) for i in range(len(words) - n + 1))
         return [id for id in dict.fromkeys(id for p in phrases for id in self._named.get(p, ())) if id in self.entries]
 
@@ -325,7 +318,7 @@ class SimpleMemory:
         for note in answer.value["notes"][: self.max_notes]:
             text = one_line(note.text)
             if text and not self.entries.confirm(text, at):
-                added.append(Entry(self.services.new_id(), text, at, _data(note)))
+                added.append(Entry(self.services.new_id(), text, at, data_of(note)))
                 self._put(added[-1])
         if self.consolidate:
             await self._merge([e for e in added if e.id in self.entries])
@@ -350,7 +343,7 @@ class SimpleMemory:
         answer = await self.services.ask("merge", (system(MERGE), user(notes)), self.answer_tokens, parse)
         if answer.value is None or not one_line(answer.value.text):
             return
-        data = _data(answer.value)
+        data = data_of(answer.value)
         for name in ("keywords", "names"):
             data[name] = list(dict.fromkeys([*data[name], *(n for e in largest for n in e.data[name])]))
         for entry in largest:
@@ -414,9 +407,3 @@ class SimpleMemory:
         self.archive = [Entry.load(row) for row in archive]
         self._window = [Step.load(s) for s in window]
         self._rename()
-
-
-def _data(note: Note) -> dict[str, Any]:
-    """What is kept of a note beside its text; places and entities as they are looked up."""
-    names = [" ".join(_WORD.findall(name.casefold())) for name in [note.place or "", *note.entities]]
-    return {"keywords": note.keywords, "names": list(dict.fromkeys(n for n in names if n)), "topic": note.topic or ""}

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from typing import Any
+
+WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
 
 COMPRESS = """\
 You take notes for an agent. Write what its steps taught as notes that help later: what is where (with coordinates),
@@ -41,3 +45,9 @@ class Note:
     place: str | None = ""
     entities: list[str] = field(default_factory=list)
     topic: str | None = ""
+
+
+def data_of(note: Note) -> dict[str, Any]:
+    """What is kept of a note beside its text; places and entities as they are looked up."""
+    names = [" ".join(WORD.findall(name.casefold())) for name in [note.place or "", *note.entities]]
+    return {"keywords": note.keywords, "names": list(dict.fromkeys(n for n in names if n)), "topic": note.topic or ""}

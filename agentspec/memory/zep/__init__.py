@@ -8,9 +8,10 @@ same things, and is made only where there are such. Code does the rest: what is 
 where the other begins (see `agentspec.memory.zep.temporal`), in whatever order they are told.
 
 Retrieval looks facts up by meaning, by words, and along the graph (`hops`) from what the observation names, fuses the
-three rankings by reciprocal rank (constant 0, as Graphiti does), and shows each with its times. Communities of entities
-are found by label propagation between the episodes of a run, from the labels there are; each that has changed gets a
-summary, and the summary of the community that the observation names most is shown first.
+three rankings by reciprocal rank (constant 0, as Graphiti does), and shows each with its times; what is over is marked
+so, and ranked as everything else. Communities of entities are found by label propagation between the episodes of a run,
+from the labels there are; each that has changed gets a summary, and the summary of the community that the observation
+names most is shown first.
 
 `extraction: state` makes no call at all: facts are the fields of the observation's structured state, and a field that
 changes contradicts its former value; `both` does both. It is for environments whose state is small and symbolic
@@ -30,7 +31,7 @@ Cost: `paper` 1 to 3 calls a step, `rl` every 8 steps; between episodes at most 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
@@ -50,7 +51,7 @@ from agentspec.memory.parts.entries import (
 )
 from agentspec.memory.zep.communities import Communities
 from agentspec.memory.zep.prompts import COMMUNITY, EARLIER, EXTRACT, KNOWN, RESOLVE, SAME, Extracted, Resolved
-from agentspec.memory.zep.temporal import TemporalGraph, normal
+from agentspec.memory.zep.temporal import TemporalGraph, fields_of, normal
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Services, Time
 from agentspec.state import dump_state, joined, load_state
@@ -355,7 +356,7 @@ class ZepMemory:
 
     def _read_state(self, state: Mapping[str, Any], at: Time) -> None:
         """Facts out of a structured state; a field with another value ends the fact of the former one."""
-        for subject, field, value in _fields(state, "the agent"):
+        for subject, field, value in fields_of(state, "the agent"):
             id = self.graph.entity(subject)
             if id is None:
                 id = self.services.new_id()
@@ -408,12 +409,3 @@ class ZepMemory:
         self.graph.load(graph)
         self.communities.load(communities)
         self._pending = [Step.load(s) for s in pending]
-
-
-def _fields(state: Mapping[str, Any], subject: str, deep: int = 3) -> Iterator[tuple[str, str, str]]:
-    """The fields of a structured state: whose, which, and their value, where that is short."""
-    for key, value in state.items():
-        if isinstance(value, Mapping) and deep:
-            yield from _fields(value, str(key), deep - 1)
-        elif isinstance(value, str | int | float | bool) and len(str(value)) <= 60:
-            yield subject, str(key), str(value)

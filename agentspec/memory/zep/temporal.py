@@ -8,7 +8,7 @@ what contradicts them, so that the graph can be asked how things stood at any st
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -58,9 +58,10 @@ class TemporalGraph:
 
     def call(self, id: int, name: str) -> None:
         """Another name of a known entity."""
-        if normal(name) not in self._ids:
-            self._ids[normal(name)] = id
-            self._called[id].append(normal(name))
+        known_as = normal(name)
+        if known_as not in self._ids:
+            self._ids[known_as] = id
+            self._called[id].append(known_as)
             self._written.pop(id, None)
 
     def alike(self, name: str, k: int, least: float) -> list[int]:
@@ -228,9 +229,9 @@ class TemporalGraph:
         self.graph = Graph()
         self.facts.load(facts)
         for id, name, called, _ in entities:
-            self.add_entity(id, name)
-            for other in called:
-                self.call(id, other)
+            self.names[id], self._of[id], self._called[id] = name, {}, called
+            self._numbered.setdefault(_numbers(name), {})[id] = None
+            self._ids |= dict.fromkeys(called, id)
         self.graph.load([[id, [[other, 1.0] for other in near]] for id, _, _, near in entities])
         for fact in self.facts:
             for entity in self._ends(fact):
@@ -259,3 +260,12 @@ def holds(fact: Entry, step: int) -> bool:
 
 def _open(fact: Entry) -> bool:
     return fact.data["invalid"] is None
+
+
+def fields_of(state: Mapping[str, Any], subject: str, deep: int = 3) -> Iterator[tuple[str, str, str]]:
+    """The fields of a structured state: whose, which, and their value, where that is short."""
+    for key, value in state.items():
+        if isinstance(value, Mapping) and deep:
+            yield from fields_of(value, str(key), deep - 1)
+        elif isinstance(value, str | int | float | bool) and len(str(value)) <= 60:
+            yield subject, str(key), str(value)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 
 import pytest
 
 from agentspec.envs.minigrid.env import CALLS, MiniGridEnv
+from agentspec.envs.minigrid.expert import expert
 from agentspec.envs.minigrid.search import optimum, shortest_plan
 from agentspec.envs.minigrid.suites import PAPER, SUITES, layout_of
 
@@ -78,3 +80,30 @@ def test_a_mission_that_cannot_be_fulfilled_any_more_has_no_plan():
     env.reset()
     env.world.max_steps = 10
     assert shortest_plan(env.world, most_states=3) is None
+
+
+def test_practice_holds_none_of_the_ten_layouts():
+    levels = SUITES["paper"] + SUITES["memory"]
+    assert SUITES["practice"] == levels
+    tested = {(layout.id, layout.seed) for layout in PAPER}
+    drawn = [layout_of(suite="practice", seed=seed) for seed in range(10_000)]
+    assert {layout.id for layout in drawn} == set(levels)
+    assert not tested & {(layout.id, layout.seed) for layout in drawn}
+
+
+def test_the_expert_of_practice_looks_before_it_chooses():
+    """Memory's seed 10 starts past the cue, which one turn to the left shows; the shortest plan never sees it."""
+    world = {"level": "MiniGrid-MemoryS7-v0", "observation": "compact", "action_mode": "menu"}
+    played = {}
+    for look in (False, True):
+        env = MiniGridEnv(**world)
+        _, info = env.reset(seed=10)
+        player = expert({}, random.Random(0), look=look)
+        seen, ended = [], False
+        while not ended:
+            observation, _, ended, _, info = env.step(player.act(info))
+            seen.append(observation["text"])
+        assert info["success"]
+        played[look] = (len(seen), any("green ball 1 forward, 3 left" in text for text in seen))
+    assert played == {False: (3, False), True: (5, True)}
+    assert expert({"suite": "practice"}, random.Random(0))._look and not expert({}, random.Random(0))._look

@@ -9,7 +9,8 @@ import pytest
 
 from agentspec.envs.thor.engine import OfflineThor, Settings
 from agentspec.envs.thor.geodesic import corners, distances, straight
-from agentspec.envs.thor.scene import Scene, thing
+from agentspec.envs.thor.render import tint
+from agentspec.envs.thor.scene import Scene, object_id, thing
 
 # five by five cells, 1 m x 1 m; a fridge to the north, an apple on a table to the east
 CELLS = frozenset((i, j) for i in range(5) for j in range(5))
@@ -83,6 +84,59 @@ def test_slicing_needs_a_knife_and_leaves_pieces():
     pieces = [o for o in event.metadata["objects"] if o["objectType"] == "AppleSliced"]
     assert event.thing(APPLE.id) is None and len(pieces) == 5
     assert all(o["parentReceptacles"] == [TABLE.id] and o["pickupable"] for o in pieces)
+    assert {o["objectId"] for o in pieces} == {f"{APPLE.id}|AppleSliced_{n}" for n in range(1, 6)}
+    assert not any(o["sliceable"] for o in pieces) and all(o["isSliced"] for o in pieces)
+    assert not act(w, "SliceObject", objectId=APPLE.id).success
+    assert not act(w, "SliceObject", objectId=pieces[0]["objectId"]).success
+
+
+def test_pieces_are_taken_and_put_one_by_one():
+    w = world()
+    act(w, "PickupObject", objectId=KNIFE.id)
+    act(w, "SliceObject", objectId=APPLE.id)
+    act(w, "PutObject", objectId=KNIFE.id, receptacleObjectId=TABLE.id)
+    one = f"{APPLE.id}|AppleSliced_2"
+    assert act(w, "PickupObject", objectId=one).success
+    act(w, "RotateLeft")
+    act(w, "OpenObject", objectId=FRIDGE.id)
+    event = act(w, "PutObject", objectId=one, receptacleObjectId=FRIDGE.id)
+    assert event.thing(FRIDGE.id)["receptacleObjectIds"] == [EGG.id, one]
+
+
+def test_an_egg_is_cracked_without_a_knife():
+    w = world()
+    act(w, "RotateLeft")
+    act(w, "OpenObject", objectId=FRIDGE.id)
+    event = act(w, "SliceObject", objectId=EGG.id)
+    cracked = event.thing(f"{EGG.id}|EggCracked_1")
+    assert event.success and cracked["parentReceptacles"] == [FRIDGE.id] and event.thing(EGG.id) is None
+
+
+def test_what_is_in_the_hand_or_shut_away_is_not_sliced():
+    w = world()
+    act(w, "PickupObject", objectId=APPLE.id)
+    assert not act(w, "SliceObject", objectId=APPLE.id).success
+    assert not act(world(), "SliceObject", objectId=EGG.id).success  # in the closed fridge
+
+
+@pytest.mark.parametrize(
+    ("position", "made"),
+    [
+        ((-1.835, 0.59083575, 4.12483025), "KeyChain|-01.84|+00.59|+04.12"),
+        ((0.0, 1.005, -10.0), "KeyChain|+00.00|+01.00|-10.00"),
+    ],
+)
+def test_ids_round_as_the_simulator_does(position, made):
+    assert object_id("KeyChain", position) == made
+
+
+def test_a_laptop_is_placed_open():
+    w = world()
+    pose = {"objectName": "Laptop_1", "position": {"x": 1.7, "y": 0.7, "z": 0.5}}
+    event = act(w, "SetObjectPoses", objectPoses=[pose])
+    laptop = next(o for o in event.metadata["objects"] if o["objectType"] == "Laptop")
+    assert laptop["isOpen"]
+    assert act(w, "CloseObject", objectId=laptop["objectId"]).success
 
 
 @pytest.mark.parametrize(
@@ -152,6 +206,31 @@ def test_pictures_show_what_is_there_and_only_that():
     act(w, "PickupObject", objectId=APPLE.id)
     assert (act(w, "Pass").frame != with_apple).any()
     assert (act(w, "Pass").frame == act(w, "Pass").frame).all()
+
+
+def test_pictures_show_what_stands_on_a_table_and_what_is_in_an_open_fridge():
+    w = world()
+    ink = np.array(tint("Knife"))
+    assert (np.abs(act(w, "Pass").frame - ink).sum(axis=2) < 90).any()  # small, on a large box
+    act(w, "RotateLeft")
+    shut = act(w, "Pass").frame
+    egg = np.array(tint("Egg"))
+    before = (np.abs(shut - egg.astype(int)).sum(axis=2) == 0).sum()
+    opened = act(w, "OpenObject", objectId=FRIDGE.id).frame
+    assert (np.abs(opened - egg.astype(int)).sum(axis=2) == 0).sum() > before
+
+
+def test_no_box_is_painted_over_one_that_hides_it():
+    """A long wall behind a table in a corner, for any heading: the table's pixels stay the table's."""
+    table = thing("DiningTable", (1.9, 0.0, 1.0), size=(1.6, 0.7, 0.6))
+    wall = ((1.3, 1.25, 1.4), (12.0, 2.5, 0.1))
+    with_wall, without = (OfflineThor(Scene("T", CELLS, (table,), walls)) for walls in ((wall,), ()))
+    colours = [tuple(int(c * s) for c in tint("DiningTable")) for s in (1.0, 0.9, 0.8)]
+    for yaw in (0, 30, 60, 90):
+        spot = {"action": "TeleportFull", "x": 0.5, "z": 0.25, "rotation": yaw, "horizon": 30}
+        frames = [w.step(spot).frame for w in (with_wall, without)]
+        shown = [sum((f == c).all(axis=2).sum() for c in colours) for f in frames]
+        assert shown[0] == shown[1] > 0
 
 
 def test_shortest_ways_are_straight_where_nothing_is_between():

@@ -251,6 +251,7 @@ def _draw_panel(draw: ImageDraw.ImageDraw, world: World) -> None:
     _bar(draw, 84, "battery", state.scooter.battery, (240, 180, 40))
     _bar(draw, 102, "energy", state.energy, (112, 166, 84))
     draw.text((left, 124), f"orders ({len(state.orders)})", fill=SOFT, font=_font(11))
+    draw.text((WIDTH - 14, 124), "due in", fill=SOFT, anchor="ra", font=_font(11))
     shown = list(state.orders.values())[:7]
     for row, order in enumerate(shown):
         _order_row(draw, 140 + 21 * row, world, order)
