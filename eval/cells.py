@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from agentspec.actions import suggest
@@ -137,7 +137,11 @@ class Cell:
             yield planned, record, memory
             if record is None:
                 return
-            memory = self.after(store, record, memory)
+            try:
+                memory = self.after(store, record, memory)
+            except ValueError:  # its state is gone: what comes after cannot be found, and playing will say why
+                yield from ((later, None, None) for later in chain[chain.index(planned) + 1 :][:1])
+                return
 
     def after(self, store: Store, record: Record, memory: bytes | None) -> bytes | None:
         """The memory after an episode: a failed one leaves the memory that it started from."""
@@ -154,9 +158,12 @@ def plan_cell(
     data = spec.to_data()
     if roles := data.get("roles"):
         data["roles"] = {pattern: weighed(role) for pattern, role in roles.items()}
-    configuration = store.describe(
-        {"spec": data, "policy": policy.identity(), "max_steps": settings.max_steps, "versions": versions()}
-    )
+    if isinstance(spec.embedder, Mapping):
+        data["embedder"] = weighed(spec.embedder)
+    described = {"spec": data, "policy": policy.identity(), "max_steps": settings.max_steps, "versions": versions()}
+    if spec.budget.cost is not None:  # prices say when such an episode is over
+        described["prices"] = {name: asdict(price) for name, price in settings.prices.table.items()}
+    configuration = store.describe(described)
     chains: list[tuple[Planned, ...]] = []
     for rollout in range(settings.rollouts):
         for label, members in sets.items():
