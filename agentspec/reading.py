@@ -21,7 +21,7 @@ import re
 from dataclasses import dataclass, replace
 
 from agentspec import literals, shapes
-from agentspec.literals import known_name, scan_call
+from agentspec.literals import known_name, parse_call, scan_call
 from agentspec.remarks import is_meant
 from agentspec.types import Action, ActionError, ActionSchema
 from agentspec.values import CALL, DRESS, MOST_CALLS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, squeeze
@@ -70,6 +70,9 @@ def labelled(line: str) -> bool:
 
 def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     """Read an answer; `cut` says that it ended because its room was used up."""
+    plain_action = _bare(text, schema)
+    if plain_action is not None:
+        return Reading(plain_action, explicit=text in schema.choices)
     shown, open_block = visible(text)
     plain = undressed(_bounded(shown))
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
@@ -83,6 +86,18 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     return Reading(
         ActionError(error.code, error.message, _inert(error.text, schema)), reading.thought, reading.explicit
     )
+
+
+def _bare(text: str, schema: ActionSchema) -> Action | None:
+    """The action of an answer that is one and nothing else, which needs no further reading."""
+    if text in schema.choices:
+        return Action(text, text=text)
+    match = CALL.match(text)
+    if match is None or match.group(1) not in schema.actions or not text.isascii() or re.search(r"[<\\\n]|THINK", text):
+        return None
+    call = scan_call(text, match)
+    action = parse_call(call, schema) if call is not None and call.end == len(text) else None
+    return action if isinstance(action, Action) else None
 
 
 def _inert(text: str, schema: ActionSchema) -> str:

@@ -1,10 +1,12 @@
 """Recorded ALFRED experts, replayed: how many trials reach their goal in the offline player, or through ai2thor.
 
-    python -m benchmarks.alfred_replays --data DIR [--tables DIR] [--objects DIR] [--layouts DIR] [--standin] [--json]
+    python -m benchmarks.alfred_replays --data DIR [--tables DIR] [--objects DIR] [--layouts DIR]
+        [--without-own-plan] [--standin] [--json]
 
 `--data` is searched for `traj_data.json` of scenes whose object metadata and layout are there. A scene's table (cells,
-names of furniture) is mined from the trials below `--tables`, by default the same; give other trials to see what the
-tables owe to the plans that are replayed. `--standin` plays through the Controller of ai2thor 2.1.0 and the stand-in.
+names of furniture) is mined from the trials below `--tables`, by default the same. `--without-own-plan` mines a table
+for each trial that does not know its plan (minutes). `--standin` plays through ai2thor 2.1.0's Controller and the
+stand-in.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from agentspec.envs.alfred.env import SETTINGS, set_up
 from agentspec.envs.alfred.goals import Changes, Progress, progress
+from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import Trial, read_trial
 from agentspec.envs.thor.engine import OfflineThor
 from agentspec.envs.thor.mining import household, objects_file
@@ -43,6 +45,7 @@ def main() -> None:
     parser.add_argument("--tables", type=Path, default=None)
     parser.add_argument("--objects", type=Path, default=HOUSEHOLD / "objects")
     parser.add_argument("--layouts", type=Path, default=HOUSEHOLD / "layouts")
+    parser.add_argument("--without-own-plan", action="store_true")
     parser.add_argument("--standin", action="store_true")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
@@ -60,7 +63,8 @@ def main() -> None:
             continue
         if remote is not None:
             remote.begin(trial.scene)
-        world: Thor = remote or OfflineThor(household(trial.scene, *folders.values()), SETTINGS)
+        unknown = trial.id if given.without_own_plan else ""
+        world: Thor = remote or OfflineThor(household(trial.scene, *folders.values(), leave_out=unknown), SETTINGS)
         reached, failed = replay(world, trial)
         row = counts[trial.type + (", sliced" if trial.targets.sliced else "")]
         for k, value in enumerate((1, reached.success, reached.met, reached.total, failed == 0)):

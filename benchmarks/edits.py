@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import json_line
+from agentspec.state import dump_state
 
-UPDATES, MANIFEST, SEAL = "updates.jsonl", "manifest.json", "seal.json"
+UPDATES, MANIFEST, SEAL, MEMORY = "updates.jsonl", "manifest.json", "seal.json", "memory.json"
 METRICS, EVALUATIONS = "metrics.jsonl", "evaluations.jsonl"
 EPISODES = "trajectories/{:06d}.jsonl"
 
@@ -29,6 +30,8 @@ def spelled(path: Path, records: Records) -> str:
         return json.dumps(records[0], indent=2, sort_keys=True) + "\n"
     if path.name == SEAL:
         return json.dumps(records[0], indent=1, sort_keys=True) + "\n"
+    if path.name == MEMORY:
+        return dump_state(records[0]).decode()
     if path.parent.name == "trajectories":
         return "".join(json.dumps(r, sort_keys=True, separators=(",", ":"), ensure_ascii=False) + "\n" for r in records)
     return "".join(map(json_line, records))
@@ -167,6 +170,12 @@ def _richer_receipt(records: Records) -> None:
     records[1]["returns"][:2] = [value + 5.0 for value in records[1]["returns"][:2]]
 
 
+def _other_memory(records: Records) -> None:
+    states = records[0]["states"]
+    name = next(iter(states))
+    states[name] = states[name].replace("a", "o", 1) + " "
+
+
 First = EPISODES.format(0)
 Second = EPISODES.format(1)
 
@@ -221,13 +230,9 @@ KINDS: dict[str, list[tuple[str, Change]]] = {
     "versions in the manifest": [(MANIFEST, _set(0, "versions", "numpy", value="0.0"))],
     "logged metrics": [(METRICS, _set(1, "reward", value=1e3))],
     "an evaluation": [(EVALUATIONS, _set(0, "eval_reward", value=1e3))],
+    "a memory that is carried": [(MEMORY, _other_memory)],
 }
 """Kind -> what is done to which file of a run of at least three updates."""
-
-
-def without_first_round(folder: Path) -> None:
-    """A trajectory file that is gone."""
-    (folder / First).unlink()
 
 
 def with_a_round_more(folder: Path) -> None:
@@ -246,6 +251,21 @@ def with_a_file_of_another_name(folder: Path) -> None:
     (folder / First).with_name("more.jsonl").write_bytes((folder / First).read_bytes())
 
 
+def without(name: str) -> Callable[[Path], None]:
+    """A file that is gone."""
+
+    def change(folder: Path) -> None:
+        (folder / name).unlink()
+
+    return change
+
+
+def with_a_line_more(folder: Path) -> None:
+    """A record that was written after the end."""
+    with open(folder / METRICS, "a", encoding="utf-8") as file:
+        file.write(json_line({"step": 3, "reward": 1e3}))
+
+
 def with_bytes(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
     """A line that no reader looks at: `new` instead of the last `old`."""
 
@@ -257,7 +277,10 @@ def with_bytes(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
 
 
 FILE_KINDS: dict[str, Callable[[Path], None]] = {
-    "a trajectory file deleted": without_first_round,
+    "a trajectory file deleted": without(First),
+    "the memories deleted": without(MEMORY),
+    "the seal deleted": without(SEAL),
+    f"a line added to {METRICS}": with_a_line_more,
     "a trajectory file added": with_a_round_more,
     "bytes that read the same": with_spaces,
     "a trajectory file of another name added": with_a_file_of_another_name,

@@ -2,11 +2,11 @@
 
     python -m benchmarks.tamper [--json]
 
-A tiny honest run is made (a random model, groups of two, a memory that asks the model, menus, evaluation while
-training). Then, on a copy each time, one thing is changed and the audit is run: each of the kinds of
-`benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, one line of metrics and one
-of evaluations. Honest runs of every estimator, and of other settings that change what an update is made of, must have
-no violation at all.
+A tiny honest run is made (a random model, groups of two, a memory that asks the model and is carried over episodes,
+menus, evaluation while training). Then, on a copy each time, one thing is changed and the audit is run: each of the
+kinds of `benchmarks.edits`, and every leaf of one receipt, one trajectory, the manifest, the seal, the memories that
+are carried, one line of metrics and one of evaluations. Honest runs of every estimator, and of other settings that
+change what an update is made of, must have no violation at all.
 
 Files that are only shown to people or can be computed again (plots, evaluation tables, the weights, what the terminal
 saw) are no records and are not covered: `excepted` names them. Times are recorded, and covered like everything else.
@@ -31,6 +31,7 @@ from benchmarks.edits import (
     FILE_KINDS,
     KINDS,
     MANIFEST,
+    MEMORY,
     METRICS,
     SEAL,
     UPDATES,
@@ -52,6 +53,7 @@ RUN: dict[str, Any] = {
     "agent": {
         "reasoning": "react",
         "memory": {"name": "summary", "every": 1, "summary_tokens": 4},
+        "scope": "run",
         "sampling": {"max_tokens": 4},
     },
     "train_calls": ["reasoning.*", "memory.summary"],
@@ -111,6 +113,7 @@ def tamper(folder: Path, every: int = 1) -> dict[str, Any]:
         (EPISODES.format(1), 0),
         (MANIFEST, 0),
         (SEAL, 0),
+        (MEMORY, 0),
         (METRICS, 1),
         (EVALUATIONS, 1),
     ):

@@ -28,7 +28,8 @@ from typing import Any
 import gymnasium
 
 from agentspec.envs import experts
-from agentspec.envs.alfred.env import AlfredEnv, set_up
+from agentspec.envs.alfred.env import AlfredEnv
+from agentspec.envs.alfred.staging import set_up
 from agentspec.envs.deliverybench.world.engine import World
 from agentspec.envs.making import make_env
 from agentspec.envs.thor.engine import OfflineThor

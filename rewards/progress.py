@@ -23,20 +23,23 @@ def goal_progress(trajectory: Trajectory) -> tuple[float, ...]:
 def geodesic_progress(trajectory: Trajectory) -> tuple[float, ...]:
     """Metres that a step came nearer to where the target is seen, on foot, over the shortest path's length.
 
-    Clipped to the metres that the step moved, either way (AllenAct's shaping): a jump of the measured distance pays
-    nothing that was not walked. Paths shorter than a metre count as one. Steps beside the known floor pay 0.
+    Clipped to the metres that the step moved, either way (AllenAct's shaping): a jump of the measured distance is paid
+    as it is walked, and what a clip left out is settled by the steps after it. So no loop earns anything. Paths shorter
+    than a metre count as one. Steps beside the known floor pay 0.
 
     Raises:
         ValueError: an environment that does not report `info["geodesic"]`.
     """
     reports = _reports(trajectory, "geodesic_progress", "geodesic")
-    before, walked = (reports[0]["start"], 0.0) if reports else (None, 0.0)
+    level, walked = (reports[0]["start"], 0.0) if reports else (None, 0.0)  # metres that are paid for so far
     paid = []
     for report in reports:
         after, moved = report["left"], report["walked"] - walked
-        known = before is not None and after is not None
-        paid.append(max(-moved, min(moved, before - after)) / max(report["shortest"], 1.0) if known else 0.0)
-        before, walked = after, report["walked"]
+        level = after if level is None else level
+        nearer = 0.0 if after is None else max(-moved, min(moved, level - after))
+        level = level if level is None else level - nearer
+        paid.append(nearer / max(report["shortest"], 1.0))
+        walked = report["walked"]
     return tuple(paid)
 
 

@@ -54,7 +54,7 @@ def test_the_quick_start(tmp_path: Path) -> None:
     config = parsed("quickstart_cpu.yaml")
     assert config.model == "smollm2-135m" and config.adapter and config.use_cpu
     assert config.rewards == {"earning_delta": 1.0} and config.loss_type in ("dapo", "cispo")
-    assert notes(config) == []
+    assert list(notes(config)) == []
     # Whole groups, of rollouts that are compared with each other.
     assert rollouts_per_update(config) % config.num_generations == 0
     assert parse_config([], default=CONFIGS / "quickstart_cpu.yaml").output_dir == config.output_dir

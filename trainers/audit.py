@@ -2,16 +2,10 @@
 
 First that the records are those that were written (`trainers.chain`): no record of any file was edited, deleted, added
 or moved. Then that they say the truth: the receipt of every update is made anew from its episodes and its manifest and
-compared field by field, so that
-
-- every trained token was sampled by the policy, in that episode, at that place, after exactly that prompt, among what
-  its constraint left, with the recorded log-probability and temperature (`trainers.provenance`);
-- masks cover model tokens only, and none that a constraint forced;
-- the advantage of every row is what the declared estimator gives for the returns, and those of a group sum to zero
-  where the estimator says so; what a write to memory earned is what the episodes played for it say, and these are
-  what they claim to be (`trainers.counterfactuals`);
-- the loss denominator is what the loss divides by (`trainers.losses`); padding rows train nothing; rollouts that could
-  not be scored have no rows; the settings of the loss are those of the manifest.
+compared field by field (rows, advantages, distributions, denominator, padding, settings). Beside what the trainer does,
+every trained token was sampled by the policy, there, after exactly that prompt (`trainers.provenance`), advantages of a
+group sum to zero where the estimator says so, and what a write to memory earned is what the episodes played for it say
+(`trainers.counterfactuals`).
 """
 
 from __future__ import annotations

@@ -14,12 +14,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from agentspec.carry import FILE as MEMORY
 from agentspec.files import digest, file_digest, parse_line, whole_lines
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers import run_folder
 from trainers.digests import differing, field_digests
-from trainers.run_folder import MANIFEST, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.run_folder import MANIFEST, METRICS, SEAL, TRAJECTORIES, UPDATES
 from trainers.runlog import FORMAT, digest_of, round_files, seal_of
 
 
@@ -160,7 +161,8 @@ def check_end(folder: Path, config: Mapping[str, Any], head: str = "") -> tuple[
         problems.append(f"{MEMORY} is not what the last receipt says (`chain.memory`): it was edited or replaced")
     if sealed:
         return problems, []
-    if head or max(steps.values()) >= _wanted(folder, config):
+    wanted = _wanted(folder, config)
+    if head or (reached >= wanted and (max(steps.values()) >= wanted or any(folder.glob("*.safetensors")))):
         why = f"the head {head} is that of a run that had ended" if head else f"all {reached} steps were made"
         return [*problems, f"{SEAL} is missing, and {why}: it was deleted, or the run killed at its very end"], []
     return problems, [f"no {SEAL}: interrupted or under way after update {last}; nothing after its receipt is covered"]

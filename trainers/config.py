@@ -1,8 +1,7 @@
 """The configuration of a run: TRL's `GRPOConfig` plus what the scaffold adds, in one dataclass.
 
 `trainers.arguments` fills it from a YAML file and from the command line, and its docstring is what `--help` says of
-each field; no other class mirrors it. What cannot work
-or would not be exact is refused at start, with the reason and the remedy (`trainers.checks`).
+each field. What cannot work or would not be exact is refused at start (`trainers.checks`).
 """
 
 from __future__ import annotations
@@ -43,33 +42,30 @@ class ScaffoldConfig(GRPOConfig):
         train_calls: patterns over `module/purpose` of the calls that are trained.
         train_credits: credits that are trained (`executed`, `explored`, `aux`).
         rewards: weight by registered reward; default `{earning_delta: 1.0}`.
-        reference: with `beta` above 0, what the policy is kept near: the `initial` policy, as training began (its
-            adapter included), or the `base` model without any adapter.
+        reference: with `beta` above 0, what the policy is kept near: the `initial` policy (its adapter included), or
+            the `base` model without any adapter.
         estimator: how returns become advantages: a name in `trainers.estimators.ESTIMATORS`.
         gamma: discount per step of the step-level estimators.
         gigpo_weight: weight of the step advantage in `gigpo`.
         skip_zero_variance: leave groups to which the estimator gives no advantage out of the denominator too.
-        normalize: `token` gives every trained token the same weight (an episode that trains more tokens counts more);
-            `rollout` every rollout, so that call-heavy scaffolds do not inflate the loss.
+        normalize: what weighs the same: every trained `token`, or every `rollout` however many it trains.
         overlong: what happens to episodes that ended for a reason in `overlong_ends`: `mask` (zero loss, still in
             the baseline: SUPO's default), `keep` or `drop` (neither loss nor baseline).
         overlong_ends: ends that make an episode overlong: `context`, `budget`, `max_steps`, `truncated`.
         mask_truncated: patterns of calls whose completions are not trained when they hit their length limit.
-        memory_carry: with `scope: run`, whose memory a task carries on: that of its `first` rollout in a round, or
-            of its `best`. All rollouts of a task start from the same memory; tasks share none.
+        memory_carry: with `scope: run`, whose memory a task carries on: that of its `first` rollout, or its `best`.
         start_memory: with `scope: run`, a memory file or the folder of a run that wrote one (`memory.json`), to start
             from; empty: every task starts with an empty memory.
-        write_credit: what trained calls of memory earn, a name in `trainers.writes.WRITE_CREDITS`: what the
-            `episode` does, `local` re-rolls with and without the write, or the `ablation` of the whole memory.
+        write_credit: what trained calls of memory earn: what the `episode` does, `local` re-rolls with and without the
+            write, or the `ablation` of the whole memory (`trainers.writes.WRITE_CREDITS`).
         write_calls: patterns of the calls that write (those of memory; narrow it to leave out what only recalls).
         write_rerolls: with `local`: re-rolls with, and as many without, each write that is looked at.
         write_points: with `local`: most writes of an episode that are looked at; the others earn 0.
         retries: how often a failed episode (environment or model error) is run again before it is unscorable.
         env_timeout_s: limit of one environment call, in seconds.
         rollout_concurrency: most episodes at once (0: all of a generation batch).
-        batching: when the local backend takes requests into a running batch: `continuous` at any time, `closed`
-            never, so that runs repeat on every device; `auto` is `continuous` where that repeats to the last bit
-            (a CPU in float32), else `closed`, with a warning (`agentspec.llm.batching`).
+        batching: when the local backend takes requests into a running batch: `continuous` at any time, `closed` never;
+            `auto` is `continuous` where runs repeat to the last bit with it (`agentspec.llm.batching`).
         packing: `tree` computes shared prefixes of the update once, `padded` computes every row; gradients agree.
         tokens_per_forward: token budget of one forward of the update (0: the whole micro-batch for a tree, row by row
             for padded rows); chunks beyond one are recomputed backward, which bounds memory.
@@ -77,16 +73,14 @@ class ScaffoldConfig(GRPOConfig):
         lora_alpha: scale of the adapter (0: twice the rank).
         lora_targets: module names that carry LoRA (`all-linear` or a list).
         lora_layers: number of top layers that carry LoRA (0: all); fewer layers, shorter backward pass, less memory.
-        vllm_importance_sampling_mode: the importance ratio of a token that was sampled by vLLM's kernels and not the
-            trainer's: clipped at `vllm_importance_sampling_clip_max` (`token_truncate`) or 0 beyond it
-            (`token_mask`); both need `vllm_importance_sampling_correction`.
+        vllm_importance_sampling_mode: the importance ratio of a token that vLLM sampled: clipped at
+            `vllm_importance_sampling_clip_max` (`token_truncate`) or 0 beyond it (`token_mask`).
         vllm_batch_invariant: run the colocated vLLM in its batch-invariant mode (`VLLM_BATCH_INVARIANT=1`), so that
             runs repeat however requests meet; NVIDIA GPUs of compute capability 8.0 and above.
         eval_specs: agent specs to evaluate under after training: mappings or paths.
         eval_sampling: sampling overrides at evaluation (default: greedy).
-        validation_tasks: number of held-out tasks (seeds `10000 ..`) that are played every `eval_steps` updates
-            with `eval_strategy: steps`; the best checkpoint by `metric_for_best_model` (default `reward`, the
-            mean under the training scaffold) is kept, and is the result with `load_best_model_at_end`.
+        validation_tasks: number of held-out tasks (seeds `10000 ..`) that are played every `eval_steps` updates with
+            `eval_strategy: steps`; the best checkpoint by `metric_for_best_model` (default `reward`) is kept.
         validation_specs: further agent specs to validate under, beside the training scaffold.
         plots: write the reward curve as PNG when training ends.
         resume: continue from the last checkpoint in `output_dir`.
@@ -214,11 +208,7 @@ class ScaffoldConfig(GRPOConfig):
 
 def agent_spec(value: Any) -> AgentSpec:
     """A spec from a mapping, a YAML path, or nothing (all defaults)."""
-    if value is None:
-        return AgentSpec()
-    if isinstance(value, str):
-        return AgentSpec.from_yaml(value)
-    return AgentSpec.from_data(value)
+    return AgentSpec.from_yaml(value) if isinstance(value, str) else AgentSpec.from_data({} if value is None else value)
 
 
 def _listed(specs: list[Any] | str) -> list[Any]:

@@ -1,13 +1,11 @@
 """Credit: from the scored episodes of an update to rows with advantages.
 
-A `CreditRule` is everything that credit depends on, and the one place where it is decided. A run's configuration
-gives it to the trainer, the run's manifest to whoever checks the run. It looks at whole episodes: one that could not be
-scored counts in no baseline and has no rows; an overlong one is masked, kept or dropped; how many sequences an episode
-became changes nobody's baseline, and all of them share its advantage.
+A `CreditRule` is everything that credit depends on: a run's configuration gives it to the trainer, the run's manifest
+to whoever checks the run. It looks at whole episodes: one that could not be scored counts in no baseline and has no
+rows; an overlong one is masked, kept or dropped; all sequences of an episode share its advantage.
 
-A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). A call
-made after the last step earns nothing in its episode and has no row (`trainers.sequences`). What memory writes may
-be credited by estimators of its own, from episodes played beside the batch (`trainers.writes`).
+A token of step t earns what its episode earns from step t on (estimators per step), or all of it (per episode). What
+memory writes may be credited by estimators of its own, from episodes played beside the batch (`trainers.writes`).
 """
 
 from __future__ import annotations
@@ -53,11 +51,8 @@ class ScoredEpisode:
 class Outcome:
     """What every rank must know of an episode before groups can be formed.
 
-    Args:
-        rewards: per step; `None` if the episode could not be scored.
-        anchors: per step the state its action was taken in, if the estimator needs it.
-        overlong: whether it ended for one of the reasons that make it overlong.
-        beside: what its counterfactuals earned.
+    `rewards` are per step, `None` if it could not be scored; `anchors` the states that actions were taken in, where
+    the estimator needs them; `beside` is what its counterfactuals earned.
     """
 
     rewards: tuple[float, ...] | None
@@ -75,8 +70,9 @@ class Credited:
 
 
 SAME = ("estimator", "gamma", "gigpo_weight", "normalize", "overlong", "skip_zero_variance")
-FIELDS = (*SAME, "num_generations", "overlong_ends", "train_calls", "train_credits", "mask_truncated", "rewards")
-FIELDS += ("write_credit", "write_calls", "write_rerolls", "write_points")
+WRITE_FIELDS = ("write_credit", "write_calls", "write_rerolls", "write_points")
+TRAINED_FIELDS = ("train_calls", "train_credits", "mask_truncated")
+FIELDS = (*SAME, "num_generations", "overlong_ends", "rewards", *TRAINED_FIELDS, *WRITE_FIELDS)
 """Fields of a configuration that credit depends on; those of `SAME` are called so in the rule too."""
 
 
@@ -112,14 +108,14 @@ class CreditRule:
         """
         if missing := [name for name in FIELDS if name not in config]:
             raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
-        given = {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
+        given: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in config.items()}
         rewards = given["rewards"]
         return cls(
             group=given["num_generations"],
             overlong_ends=given["overlong_ends"],
-            train=TrainFilter(given["train_calls"], given["train_credits"], given["mask_truncated"]),
+            train=TrainFilter(*(given[name] for name in TRAINED_FIELDS)),
             rewards=RewardSet({rewards: 1.0} if isinstance(rewards, str) else rewards).weights,
-            writes=WriteRule(*(given[f"write_{name}"] for name in ("credit", "calls", "rerolls", "points"))),
+            writes=WriteRule(*(given[name] for name in WRITE_FIELDS)),
             **{name: given[name] for name in SAME},
         )
 

@@ -1,9 +1,8 @@
 """Estimators: how the returns of a group become advantages. One function and one row of `ESTIMATORS` adds one.
 
-An estimator sees the scorable rollouts of one group and nothing else: no failed rollout, no token, no sequence, so
-that none of these can change a baseline. One *per episode* gets their returns and gives one number each; one *per step*
-gets their rewards per step and gives as many numbers. Plain floats in and out, so that whoever checks a run computes
-the very same numbers without a model in sight.
+An estimator sees the scorable rollouts of one group and nothing else: no failed rollout, no token, no sequence can
+change a baseline. One *per episode* gets returns and gives one number each; one *per step* gets rewards per step and
+gives as many numbers. Plain floats in and out: whoever checks a run computes the very same numbers.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ class EstimatorSpec:
     """One row of the table.
 
     Args:
-        name: as in `estimator: NAME`.
         function: per episode: returns (n,) -> advantages (n,); per step: rewards, ragged (n, steps) -> the same shape.
-        summary: what it does, in one line.
-        per_step: whether it gives one advantage per step.
         zero_sum: whether the advantages of a group sum to zero (what an audit may expect of an honest run).
         needs: keyword arguments of `function` that come from the configuration (`gamma`, `gigpo_weight`) or from the
             episodes (`anchors`: per rollout and step the state in which the action was taken).
@@ -66,9 +62,7 @@ def centred(returns: Returns) -> list[float]:
 
 
 def rloo(returns: Returns) -> list[float]:
-    """Leave-one-out: each return minus the mean of the *others* (Ahmadian et al., 2024).
-
-    That is the centred return times n / (n - 1); a lone rollout gets 0.
+    """Leave-one-out: each return minus the mean of the *others* (Ahmadian et al., 2024); a lone rollout gets 0.
 
     >>> rloo([1.0, 0.0])
     [1.0, -1.0]
@@ -78,10 +72,7 @@ def rloo(returns: Returns) -> list[float]:
 
 
 def max_rl(returns: Returns) -> list[float]:
-    """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710).
-
-    The gradient of a truncated series of the log-likelihood of success: a task that is rarely solved counts about
-    1 / p. A group that earned nothing has no signal.
+    """Centred, divided by the group's *mean* (Tajwar et al., 2026, arXiv 2602.02710): rare success counts 1 / p.
 
     >>> max_rl([1.0, 0.0, 0.0, 0.0])
     [3.0, -1.0, -1.0, -1.0]
@@ -91,8 +82,8 @@ def max_rl(returns: Returns) -> list[float]:
     """
     if any(value < -TOLERANCE for value in returns):
         raise SpecError(
-            f"estimator 'max_rl' divides by the mean return, a rate of success: expected returns >= 0, got "
-            f"{list(returns)}; choose rewards that are never negative, or another estimator"
+            f"estimator 'max_rl' divides by the mean return: expected returns >= 0, got {list(returns)}; choose "
+            "rewards that are never negative, or another estimator"
         )
     mean = math.fsum(returns) / len(returns) if returns else 0.0
     return [value / mean for value in _centred(returns)] if mean > 0 else [0.0] * len(returns)
@@ -111,8 +102,8 @@ def reward_to_go(rewards: Rewards, *, gamma: float = 1.0) -> list[list[float]]:
     """Discounted reward-to-go, centred per step over the group and scaled by the group's deviation.
 
     The baseline of step t is the mean over all rollouts; one that has ended earns nothing more, so it counts with 0.
-    The deviation is the sample deviation of the centred values of all steps that were taken, about their own mean: where
-    rollouts end at different times this is not 0.
+    The deviation is the sample deviation of the centred values of all steps that were taken, about their own mean (it
+    is not 0 where rollouts end at different times).
     """
     togo = [discounted(r, gamma) for r in rewards]
     if len(togo) < 2:

@@ -1,9 +1,7 @@
 """Losses: the objective of a token and what the sum is divided by. One function and one row of `LOSSES` adds one.
 
-TRL's losses are TRL's code: such a row names the `loss_type` that computes it. A row of ours brings an `objective`.
-Either way the row says what divides the sum over an update (`UpdateSize`), which tokens it clips, which settings
-it reads and how, if at all, it depends on the way episodes split into rows; the trainer, the configuration check, the
-clip shares, the audit and the table in the docs follow from it.
+TRL's losses are TRL's code: such a row names the `loss_type` that computes it; a row of ours brings an `objective`. The
+trainer, the configuration check, the clip shares, the audit and the table in the docs follow from the row.
 """
 
 from __future__ import annotations
@@ -16,9 +14,9 @@ from agentspec.actions import suggest
 from agentspec.registry import SpecError
 
 if TYPE_CHECKING:
-    import torch  # only tensors handed in are touched: the audit reads this table without it
+    from torch import Tensor  # only tensors handed in are touched: the audit reads this table without it
 
-Objective = Callable[..., "torch.Tensor"]
+Objective = Callable[..., "Tensor"]
 """`(logps, old, advantages, *, low, high)` -> loss per token; (B, T) each, advantages (B, 1) or (B, T)."""
 
 
@@ -47,34 +45,27 @@ def constant_length(size: UpdateSize) -> int:
     return size.rollouts * size.length
 
 
-def pushed_outside(
-    logps: torch.Tensor, old: torch.Tensor, advantages: torch.Tensor, *, low: float, high: float
-) -> torch.Tensor:
+def pushed_outside(logps: Tensor, old: Tensor, advantages: Tensor, *, low: float, high: float) -> Tensor:
     """PPO's clipping: the ratio has left [1 - low, 1 + high] on the side that the advantage pushes to."""
     ratio = (logps - old).exp()
     return ((ratio < 1 - low) & (advantages < 0)) | ((ratio > 1 + high) & (advantages > 0))
 
 
-def above_cap(
-    logps: torch.Tensor, old: torch.Tensor, advantages: torch.Tensor, *, low: float, high: float
-) -> torch.Tensor:
+def above_cap(logps: Tensor, old: Tensor, advantages: Tensor, *, low: float, high: float) -> Tensor:
     """CISPO's cap: the ratio is above `high` (a bound, not a distance from 1), where the advantage is positive."""
     return ((logps - old).exp() > high) & (advantages > 0)
 
 
-def probability_moved(
-    logps: torch.Tensor, old: torch.Tensor, advantages: torch.Tensor, *, low: float, high: float
-) -> torch.Tensor:
+def probability_moved(logps: Tensor, old: Tensor, advantages: Tensor, *, low: float, high: float) -> Tensor:
     """DPPO's trust region: the token's probability moved by more than `low` or `high` where it is pushed to."""
     moved = logps.exp() - old.exp()
     return ((moved < -low) & (advantages < 0)) | ((moved > high) & (advantages > 0))
 
 
-def dppo(logps: torch.Tensor, old: torch.Tensor, advantages: torch.Tensor, *, low: float, high: float) -> torch.Tensor:
+def dppo(logps: Tensor, old: Tensor, advantages: Tensor, *, low: float, high: float) -> Tensor:
     """Divergence PPO with the binary total variation (arXiv 2602.04879): `-ratio A`, 0 outside the trust region.
 
-    A ratio is a poor measure of how far a rare token moved: from 0.001 to 0.002 it doubles. Here `epsilon` and
-    `epsilon_high` bound the change of the probability itself.
+    `epsilon` and `epsilon_high` bound the change of the probability itself: a rare token's ratio says little of it.
     """
     outside = probability_moved(logps.detach(), old, advantages, low=low, high=high)
     return (-(logps - old).exp() * advantages).masked_fill(outside, 0.0)
@@ -85,10 +76,7 @@ class LossSpec:
     """One row of the table.
 
     Args:
-        name: as in `loss_type: NAME`.
-        summary: the loss of an update, in one line.
         trl: TRL's `loss_type` whose code computes it; empty where `objective` does.
-        objective: ours: see `Objective`.
         denominator: what the sum over the update is divided by, where it is one number.
         clipped: which tokens lose their gradient to clipping; arguments as of `objective`.
         uses: settings of the configuration that it reads.
@@ -141,16 +129,14 @@ LOSSES: dict[str, LossSpec] = {
             "grpo",
             "clipped ratio x advantage: mean over rows of the mean over a row's tokens",
             trl="grpo",
-            depends_on_rows="each row has the same weight, so an episode of three rows counts three times one of "
-            "a single row",
+            depends_on_rows="each row has the same weight: an episode of three rows counts three times one of one row",
             row_mean=True,
         ),
         LossSpec(
             "bnpo",
             "clipped ratio x advantage: mean over micro-batches of the mean over their tokens",
             trl="bnpo",
-            depends_on_rows="each micro-batch is normalised by its own tokens, so the weights depend on how rows were "
-            "partitioned",
+            depends_on_rows="each micro-batch is normalised by its own tokens, so weights depend on the partition",
         ),
     )
 }
@@ -177,6 +163,6 @@ def loss(name: str) -> LossSpec:
     return LOSSES[name]
 
 
-def divergence(logps: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
+def divergence(logps: Tensor, reference: Tensor) -> Tensor:
     """Unbiased estimate of the divergence from the reference per token (Schulman's k3), as TRL's."""
     return (reference - logps).exp() - (reference - logps) - 1

@@ -71,9 +71,6 @@ def receipt_record(
         round: number of the generation round: optimiser steps before it.
         played: id and return of every episode of the round.
         rows: of all ranks, as of `receipt_rows`.
-        padding_rows: rows that fill up micro-batches and train nothing.
-        denominator: what the loss is divided by (`trainers.losses`).
-        settings: as of `settings`.
     """
     return {
         "format": FORMAT,

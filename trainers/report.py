@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, TextIO
+from typing import Any
 
 from transformers import ProgressCallback, TrainerCallback
 
 from agentspec.trajectory import Trajectory
 
 BARS = "▁▂▃▄▅▆▇█"
+SAMPLE_EVERY, STEPS_SHOWN = 5, 8
 
 
 def sparkline(values: Sequence[float], width: int = 40) -> str:
@@ -20,18 +21,9 @@ def sparkline(values: Sequence[float], width: int = 40) -> str:
     '▁▃▅█'
     """
     shown = list(values)[-width:]
-    if not shown:
-        return ""
-    low, high = min(shown), max(shown)
+    low, high = min(shown, default=0.0), max(shown, default=0.0)
     span = (high - low) or 1.0
     return "".join(BARS[min(len(BARS) - 1, int((v - low) / span * len(BARS)))] for v in shown)
-
-
-def episode_lines(trajectory: Trajectory, most: int = 8) -> list[str]:
-    """The first steps of an episode, one line each."""
-    lines = [f"    {t.step + 1:>3}  {t.action_text[:60]:<60} {t.reward:+.2f}" for t in trajectory.transitions[:most]]
-    rest = len(trajectory.transitions) - most
-    return [*lines, f"         ... {rest} more steps"] if rest > 0 else lines
 
 
 class Bar(ProgressCallback):
@@ -42,50 +34,48 @@ class Bar(ProgressCallback):
 
 
 class TerminalReport(TrainerCallback):
-    """Prints after every logged update; every `sample_every` updates also a rollout.
+    """Prints after every logged update; every `SAMPLE_EVERY` updates also a rollout.
 
     Args:
         episodes: gives the episodes of the last generation round.
     """
 
-    def __init__(
-        self,
-        episodes: Callable[[], Sequence[Trajectory]],
-        sample_every: int = 5,
-        stream: TextIO | None = None,
-    ) -> None:
+    def __init__(self, episodes: Callable[[], Sequence[Trajectory]]) -> None:
         self.episodes = episodes
-        self.sample_every = sample_every
-        self.stream = stream or sys.stderr
         self.rewards: list[float] = []
 
     def on_log(self, args: Any, state: Any, control: Any, logs: dict[str, Any] | None = None, **_: Any) -> None:
-        if not state.is_world_process_zero or not logs or "reward" not in logs or logs["reward"] is None:
+        if not state.is_world_process_zero or not logs or logs.get("reward") is None:
             return
         self.rewards.append(float(logs["reward"]))
-        line = (
-            f"step {state.global_step:>4}/{state.max_steps}  reward {self.rewards[-1]:+7.3f} "
-            f"(sd {float(logs.get('reward_std') or 0):.3f})  {sparkline(self.rewards)}  "
-            f"rows/episode {float(logs.get('rollouts/rows_per_episode') or 0):.1f}  "
-            f"logp diff {float(logs.get('sampling/logp_difference_max') or 0):.1e}"
+        deviation, rows, difference = (
+            float(logs.get(name) or 0)
+            for name in ("reward_std", "rollouts/rows_per_episode", "sampling/logp_difference_max")
         )
-        print(f"\n{line}", file=self.stream, flush=True)
-        if self.sample_every and len(self.rewards) % self.sample_every == 1 % self.sample_every:
-            self._sample()
+        _say(
+            f"\nstep {state.global_step:>4}/{state.max_steps}  reward {self.rewards[-1]:+7.3f} (sd {deviation:.3f})  "
+            f"{sparkline(self.rewards)}  rows/episode {rows:.1f}  logp diff {difference:.1e}"
+        )
+        scored = [t for t in self.episodes() if t.scorable] if len(self.rewards) % SAMPLE_EVERY == 1 else []
+        if scored:
+            _sample(max(scored, key=lambda t: float(t.metrics.get("return", 0.0))))
 
     def on_evaluate(self, args: Any, state: Any, control: Any, metrics: dict[str, float], **_: Any) -> None:
         """One line per scaffold that was validated."""
-        if not state.is_world_process_zero:
-            return
-        for name, value in metrics.items():
-            prefix, found, _rest = name.partition("reward")
-            if found and not _rest:
-                scaffold = prefix.removeprefix("eval_").rstrip("/") or "training scaffold"
-                print(f"  held-out tasks, {scaffold}: reward {value:+.3f}", file=self.stream, flush=True)
+        for name, value in metrics.items() if state.is_world_process_zero else ():
+            if name.endswith("reward"):
+                scaffold = name.removesuffix("reward").removeprefix("eval_").rstrip("/") or "training scaffold"
+                _say(f"  held-out tasks, {scaffold}: reward {value:+.3f}")
 
-    def _sample(self) -> None:
-        scored = [t for t in self.episodes() if t.scorable]
-        if scored:
-            best = max(scored, key=lambda t: float(t.metrics.get("return", 0.0)))
-            print(f"  best rollout of this update ({best.metrics.get('return', 0.0):+.2f}):", file=self.stream)
-            print("\n".join(episode_lines(best)), file=self.stream, flush=True)
+
+def _sample(best: Trajectory) -> None:
+    """The first steps of an episode, one line each."""
+    _say(f"  best rollout of this update ({best.metrics.get('return', 0.0):+.2f}):")
+    for t in best.transitions[:STEPS_SHOWN]:
+        _say(f"    {t.step + 1:>3}  {t.action_text[:60]:<60} {t.reward:+.2f}")
+    if (rest := len(best.transitions) - STEPS_SHOWN) > 0:
+        _say(f"         ... {rest} more steps")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -1,10 +1,8 @@
 """What a checkpoint needs beyond TRL's, so that a resumed run equals the uninterrupted one.
 
-TRL and transformers save weights, optimiser, scheduler, their random states and the position in the data. A run inside
-a scaffold also has: the position within a generation round, rows that were generated and not yet used, and memories
-that outlive episodes. They are saved beside the rest as JSON (rows are token lists: nothing is pickled).
-
-The main process's state is the last file of a checkpoint: a folder without it was cut short and is not resumed from.
+A run inside a scaffold also has a position within a generation round, rows that were generated and not yet used, and
+memories that outlive episodes. They are saved beside TRL's state as JSON (nothing is pickled). The main process's is
+the last file of a checkpoint: a folder without it was cut short and is not resumed from.
 """
 
 from __future__ import annotations
@@ -25,10 +23,9 @@ from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotat
 
 from agentspec.files import write_atomic
 from agentspec.registry import SpecError
-from trainers.folder_lock import hold
 from trainers.micro_batches import ROWS
 from trainers.mixin import Base
-from trainers.run_folder import STATE, TRAINER_STATE, set_aside
+from trainers.run_folder import STATE, TRAINER_STATE, hold, set_aside
 from trainers.sequences import Row, TokenSequence
 
 FORMAT = 2

@@ -30,13 +30,14 @@ from agentspec.llm.recorder import derive_seed
 from agentspec.reflection.retroformer import PATH
 from agentspec.spec import AgentSpec, ModuleSpec, load_yaml
 from agentspec.trajectory import Trajectory
-from trainers.checks import REFLECTION, REWARD, check_retroformer
+from trainers.checks import REWARD, check_retroformer
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import ACTOR, TRAINED
 from trainers.rollouts import collect, local_llm
 from trainers.sequences import TrainFilter
+from trainers.unread import REFLECTION
 
 ADAPTERS = {PATH: TRAINED, "*": ACTOR}
 """Which adapter answers: lessons come from the trained one, everything else from the actor's."""

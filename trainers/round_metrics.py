@@ -16,25 +16,25 @@ from trl.trainer.utils import nanstd
 
 from agentspec.metrics import figures
 from agentspec.trajectory import Trajectory
-from trainers.credit import ScoredEpisode
+from trainers.credit import Gather, ScoredEpisode
 from trainers.sequences import TrainFilter, trained_completions
 
 
 @dataclass(frozen=True)
 class Played:
-    """Of one episode: its reward terms, unweighted (`None` if it failed), and its completion."""
+    """What the logs need of an episode: its reward terms, unweighted (`None` if it failed), and its completion."""
 
     terms: Mapping[str, float] | None
     length: int
     clipped: bool
 
-
-def played(episode: ScoredEpisode, train: TrainFilter) -> Played:
-    """What the logs need of an episode."""
-    completions = trained_completions(episode.trajectory, train)
-    free = [a is None or len(a) > 1 for _, c in completions for a in c.allowed or (None,) * len(c.token_ids)]
-    clipped = bool(completions) and completions[-1][1].finish_reason == "length"
-    return Played(None if episode.score is None else episode.score.sums, sum(free), clipped)
+    @classmethod
+    def of(cls, episode: ScoredEpisode, train: TrainFilter) -> Played:
+        """Of a scored episode."""
+        completions = [c for _, c in trained_completions(episode.trajectory, train)]
+        free = [a is None or len(a) > 1 for c in completions for a in c.allowed or (None,) * len(c.token_ids)]
+        clipped = bool(completions) and completions[-1].finish_reason == "length"
+        return cls(None if episode.score is None else episode.score.sums, sum(free), clipped)
 
 
 def round_metrics(
@@ -43,40 +43,28 @@ def round_metrics(
     weights: Mapping[str, float],
     *,
     group: int,
-    gather: Callable[[list[Any]], list[Any]] = list,
+    gather: Gather = list,
 ) -> dict[str, float]:
-    """Reward and completion figures of a round.
+    """Rewards as TRL computes them; lengths in trained tokens per episode, also of those that were not cut off.
 
     Args:
         episodes: this rank's.
         weights: by reward.
         group: rollouts per task.
     """
-    everyone: list[Played] = gather([played(e, train) for e in episodes])
-    return reward_metrics([p.terms for p in everyone], weights, group) | completion_metrics(everyone)
-
-
-def reward_metrics(
-    terms: Sequence[Mapping[str, float] | None], weights: Mapping[str, float], group: int
-) -> dict[str, float]:
-    """`rewards/NAME/mean` and `/std`, `reward`, `reward_std` and `frac_reward_zero_std`, as TRL computes them."""
-    values = torch.tensor([[math.nan if t is None else t[name] for name in weights] for t in terms])
-    metrics: dict[str, float] = {}
-    for i, name in enumerate(weights):
-        metrics[f"rewards/{name}/mean"] = values[:, i].nanmean().item()
-        metrics[f"rewards/{name}/std"] = nanstd(values[:, i]).item()
+    everyone: list[Played] = gather([Played.of(e, train) for e in episodes])
+    values = torch.tensor([[math.nan if p.terms is None else p.terms[name] for name in weights] for p in everyone])
     totals = (values * torch.tensor(list(weights.values()))).sum(dim=1)
     deviations = nanstd(totals.view(-1, group), dim=1)
+    metrics: dict[str, float] = {}
+    for name, column in zip(weights, values.T, strict=True):
+        metrics[f"rewards/{name}/mean"] = column.nanmean().item()
+        metrics[f"rewards/{name}/std"] = nanstd(column).item()
     metrics["reward"] = totals.nanmean().item()
     metrics["reward_std"] = nanstd(totals).item()
     metrics["frac_reward_zero_std"] = deviations.isclose(torch.zeros_like(deviations)).float().mean().item()
-    return metrics
-
-
-def completion_metrics(everyone: Sequence[Played]) -> dict[str, float]:
-    """`completions/...`: lengths in trained tokens per episode, and of those whose last answer was not cut off."""
+    metrics["completions/clipped_ratio"] = sum(p.clipped for p in everyone) / len(everyone)
     ended = [p.length for p in everyone if not p.clipped] or [0]
-    metrics = {"completions/clipped_ratio": sum(p.clipped for p in everyone) / len(everyone)}
     for kind, lengths in (("length", [p.length for p in everyone]), ("terminated_length", ended)):
         metrics[f"completions/mean_{kind}"] = sum(lengths) / len(lengths)
         metrics[f"completions/min_{kind}"] = float(min(lengths))
@@ -95,7 +83,7 @@ class SamplingMetrics:
         self.differences: list[torch.Tensor] = []
         self.ratios: list[torch.Tensor] = []
 
-    def flush(self, gather: Callable[[list[Any]], list[Any]] = list) -> dict[str, float]:
+    def flush(self, gather: Gather = list) -> dict[str, float]:
         """`sampling/logp_difference_max`, NaN if any is; with ratios, what TRL logs of vLLM: without NaN, as there."""
         differences, ratios = self.differences, self.ratios
         self.differences, self.ratios = [], []
@@ -110,9 +98,7 @@ class SamplingMetrics:
         return metrics
 
 
-def _summary(
-    values: Sequence[torch.Tensor], gather: Callable[[list[Any]], list[Any]]
-) -> tuple[float, dict[str, float]]:
+def _summary(values: Sequence[torch.Tensor], gather: Gather) -> tuple[float, dict[str, float]]:
     """Over all ranks: the greatest value, NaN if any is; `min`, `mean` and `max` of those that are not (0 of none)."""
     flat = torch.cat([v.detach().double().cpu() for v in values])
     known = flat[~flat.isnan()]

@@ -14,12 +14,11 @@ from transformers import PrinterCallback, ProgressCallback
 from agentspec.tasks import make_tasks
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
-from trainers.folder_lock import hold
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.report import Bar, TerminalReport
 from trainers.rollouts import task_rows
-from trainers.run_folder import last_complete_checkpoint
+from trainers.run_folder import hold, last_complete_checkpoint
 
 
 def train(

@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from agentspec.carry import FILE as MEMORY
 from agentspec.files import (
     append_lines,
     digest,
@@ -36,8 +37,9 @@ from agentspec.files import (
 )
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, versions
+from trainers import run_folder
 from trainers.digests import field_digests
-from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, MEMORY, METRICS, SEAL, TRAJECTORIES, UPDATES
+from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
 
 FORMAT = 4
 SEALED = (MANIFEST, UPDATES, MEMORY, METRICS, EVALUATIONS)
@@ -82,7 +84,7 @@ class RunLog:
 
     @property
     def sealed(self) -> bool:
-        """Whether the run has ended: nothing is added to its records any more."""
+        """Whether the run has ended."""
         return (self.folder / SEAL).is_file()
 
     def append(self, name: str, record: Mapping[str, Any]) -> None:
@@ -107,9 +109,6 @@ class RunLog:
         if memory is not None:
             chain["memory"] = digest(memory)
         self.append(UPDATES, {**record, "chain": chain})
-        self._remember(memory)
-
-    def _remember(self, memory: bytes | None) -> None:
         if memory is not None:
             write_atomic(self.folder / MEMORY, memory)
 
@@ -141,10 +140,14 @@ class RunLog:
         self.rewind(METRICS, "step", step)
         self.rewind(UPDATES, "round", step - 1)
         self.rewind(EVALUATIONS, "step", step)
-        self._remember(memory)
+        if memory is not None:
+            write_atomic(self.folder / MEMORY, memory)
         for path in round_files(self.folder):
             if int(path.name[:6]) >= step:
                 path.unlink()
+        for path in run_folder.checkpoints(self.folder):
+            if int(path.name.rpartition("-")[2]) > step:
+                (path / run_folder.STATE).unlink()  # without its records nobody may go on from it
 
 
 def round_files(folder: Path) -> list[Path]:
@@ -159,13 +162,8 @@ def digest_of(path: Path) -> str:
 
 def seal_of(folder: Path) -> str:
     """The seal of a folder as it is: of every record its digest and, of a file of lines, 16 digits of each line's."""
-    files = {
-        name: {"digest": file_digest(folder / name), "lines": _lines(folder / name)}
-        for name in SEALED
-        if (folder / name).is_file()
-    }
+    files = {}
+    for path in (folder / name for name in SEALED if (folder / name).is_file()):
+        lines = [digest(line)[:16] for _, line in whole_lines(path)] if path.suffix == ".jsonl" else []
+        files[path.name] = {"digest": file_digest(path), "lines": lines}
     return json.dumps({"format": FORMAT, "files": files}, indent=1, sort_keys=True) + "\n"
-
-
-def _lines(path: Path) -> list[str]:
-    return [digest(line)[:16] for _, line in whole_lines(path)] if path.suffix == ".jsonl" else []

@@ -228,6 +228,8 @@ def test_interquartile_mean_leaves_out_a_quarter_on_each_side():
 
 def test_performance_profile():
     assert performance_profile([0.0, 1.0, 2.0, 2.0], [-1, 0, 1.5, 2]) == [1.0, 0.75, 0.5, 0.0]
+    with pytest.raises(ValueError, match="leave failed episodes out"):  # NaN is above nothing, and would count
+        performance_profile([1.0, math.nan], [0.5])
 
 
 def test_minimum_detectable_effect():

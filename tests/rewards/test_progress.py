@@ -56,12 +56,16 @@ def test_geodesic_progress_is_clipped_by_what_was_walked():
             report(0.25, 3.75),  # 0.25 m nearer, all of it walked: 0.25 / 2
             report(0.25, 3.75),  # turned: 0
             report(0.5, 3.0),  # 0.75 m nearer by the map, 0.25 m walked: 0.25 / 2
-            report(0.75, 3.5),  # 0.5 m farther by the map, 0.25 m walked: -0.25 / 2
+            report(0.75, 3.5),  # 0.5 m farther by the map: no farther than what was paid for
             report(1.0, None),  # off the known floor
-            report(1.25, 3.0),  # and back: nothing to compare with
+            report(1.25, 3.0),  # and back: the part of the jump that was walked meanwhile
         ),
     )
-    assert rewards == (0.125, 0.0, 0.125, -0.125, 0.0, 0.0)
+    assert rewards == (0.125, 0.0, 0.125, 0.0, 0.0, 0.125)
+    circle = [
+        report(0.25 * n, left) for n, left in enumerate((3.75, 4.25, 4.0) * 40, 1)
+    ]  # jumps 0.5 m every third step
+    assert sum(paid("geodesic_progress", told(*circle))) <= 0.25 / 2  # never more than it has come nearer
     short = {"walked": 0.25, "left": 0.25, "start": 0.5, "shortest": 0.5}
     assert paid("geodesic_progress", told({"geodesic": short})) == (0.25,)  # over one metre, not over half a metre
     with pytest.raises(ValueError, match=r"needs info\['geodesic'\] at every step"):

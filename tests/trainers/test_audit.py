@@ -7,12 +7,15 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest.importorskip("trl")
+
+from datasets import Dataset
 
 from agentspec.cli import main
 from agentspec.files import digest, file_digest
@@ -22,12 +25,13 @@ from benchmarks.tamper import RUN, train
 from tests.toy_env import ToyEnv
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
-from trainers.audit import UpdateAudit, _check_advantages, _check_samples, audit, padding_rows
+from trainers.audit import _equal, audit, check_samples, check_sums, padding_rows
 from trainers.credit import CreditRule
 from trainers.digests import differing, field_digests
 from trainers.estimators import ESTIMATORS
 from trainers.provenance import check_completion, check_tokens
 from trainers.receipts import row_digest
+from trainers.rollouts import task_rows
 from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
@@ -150,11 +154,11 @@ NAMED = {
     "the same added to all returns of a group": "record 2 .*: edited: metrics.return, steps.info, steps.reward",
     "an episode deleted": "has 3 records, the receipt names 4",
     "episodes reordered": r"episodes\[0\] is .* but the receipt says",
-    "the first update deleted": r"record 1 was not the first: .*deleted",
-    "an update deleted": r"record 2 of updates.jsonl follows a record that is not here",
-    "the last update deleted": r"the last record of updates.jsonl is not that of seal.json .*: .* deleted",
-    "an update doubled": r"record 3 of updates.jsonl followed record 1: records were moved, deleted or doubled",
-    "updates reordered": r"moved, deleted or doubled",
+    "the first update deleted": r"updates.jsonl, record 1: what it followed was edited, deleted",
+    "an update deleted": r"updates.jsonl, record 2: what it followed was edited, deleted",
+    "the last update deleted": r"updates.jsonl has 2 records, seal.json says 3",
+    "an update doubled": r"updates.jsonl, record 3: what it followed was edited, deleted, doubled or moved",
+    "updates reordered": r"updates.jsonl, record 1: what it followed was edited, deleted, doubled or moved",
     "advantage in the receipt": r"updates.jsonl, update 1: rows\[0\].advantage is .* but the receipt says 9.0",
     "denominator in the receipt": "updates.jsonl, update 1: denominator is .* but the receipt says 1",
     "padding rows in the receipt": "updates.jsonl, update 1: padding_rows is .* but the receipt says 50",
@@ -172,14 +176,18 @@ NAMED = {
     "learning_rate in the manifest": "manifest.json: config.learning_rate was edited",
     "spec in the manifest": "manifest.json: spec.reasoning was edited",
     "versions in the manifest": "manifest.json: versions.numpy was edited",
-    "logged metrics": "metrics.jsonl, record 2: logged metrics edited",
-    "an evaluation": "evaluations.jsonl, record 1: logged metrics edited",
+    "logged metrics": "metrics.jsonl, record 2: edited",
+    "an evaluation": "evaluations.jsonl, record 1: edited",
+    "a memory that is carried": r"memory.json is not what the last receipt says \(`chain.memory`\)",
+    "the memories deleted": r"memory.json is not what the last receipt says \(`chain.memory`\)",
+    "a line added to metrics.jsonl": "metrics.jsonl has 4 records, seal.json says 3",
+    "the seal deleted": "seal.json is missing, and all 3 steps were made: it was deleted",
     "a trajectory file deleted": "trajectories/000000.jsonl is missing",
     "a trajectory file added": "trajectories/000900.jsonl: no receipt names it",
     "bytes that read the same": "trajectories/000001.jsonl or its digest .*; its records read as before",
     "a trajectory file of another name added": "trajectories/more.jsonl: no receipt names it",
     **{
-        f"a {what} line in {name}": rf"{name} has \d+ bytes, seal.json says \d+ \(`sizes`\)"
+        f"a {what} line in {name}": rf"{name} or its digest in seal.json was edited; its records read as before"
         for what in ("torn", "blank")
         for name in ("updates.jsonl", "metrics.jsonl", "evaluations.jsonl")
     },
@@ -227,12 +235,54 @@ def test_an_editor_who_computes_every_digest_anew_is_told_by_the_head_alone(copy
     assert any(f"not {head}" in v for v in violations(copy, head=head))
 
 
-def test_a_missing_seal_is_a_note_and_with_a_head_a_violation(copy: Path) -> None:
+def test_a_run_that_was_interrupted_is_no_violation_and_has_an_exit_code_of_its_own(
+    copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Killed in its third update: two steps are logged, of three that the manifest wants."""
     head = file_digest(copy / "seal.json")
     (copy / "seal.json").unlink()
-    findings = list(audit(copy))
-    assert [r.violations for r in findings] == [[], [], []] and "cut short" in findings[-1].notes[0]
-    assert any("seal.json is missing" in v for v in violations(copy, head=head))
+    for name in ("metrics.jsonl", "evaluations.jsonl"):
+        edit(copy / name, lambda records: records.pop() and None)
+    *updates, whole = audit(copy)
+    assert [r.round for r in updates] == [0, 1, 2] and not any(r.violations or r.notes for r in updates)
+    assert (whole.round, whole.violations) == (None, []) and "interrupted or under way after update 2" in whole.notes[0]
+    assert main(["audit", str(copy)]) == 3
+    out = capsys.readouterr().out.splitlines()
+    assert out[-1].startswith("3 updates audited: no violation; no seal.json: interrupted or under way after update 2")
+    assert main(["audit", str(copy), "--step", "1"]) == 0  # the end is not looked at
+    assert main(["audit", str(copy), "--head", head]) == 1  # that of a run that had ended
+    assert "VIOLATION seal.json is missing, and the head" in capsys.readouterr().out
+
+
+def test_memories_of_a_run_under_way_are_those_of_its_last_or_last_but_one_receipt(copy: Path) -> None:
+    """They are written after the receipt: whoever is killed in between leaves those of the round before."""
+    (copy / "seal.json").unlink()
+    for name in ("metrics.jsonl", "evaluations.jsonl"):
+        edit(copy / name, lambda records: records.pop() and None)
+    first, *_, last = (json.loads(line)["chain"]["memory"] for line in (copy / "updates.jsonl").open())
+    assert digest((copy / "memory.json").read_bytes()) == last != first
+    assert violations(copy) == []
+    RunLog(copy).receipt({"round": 3}, {}, b"later")
+    (copy / "memory.json").write_bytes(b"another")
+    assert any("memory.json is not what the last receipt says" in v for v in violations(copy))
+
+
+def test_nothing_is_added_to_the_records_of_a_run_that_has_ended(copy: Path) -> None:
+    """It would change the head that was printed, and seal whatever had been edited before."""
+    before = {p: p.read_bytes() for p in copy.rglob("*.json*")}
+    with pytest.raises(SpecError, match="its run has ended"):
+        RunLog(copy).append("metrics.jsonl", {"step": 4})
+    with pytest.raises(SpecError, match="its run has ended"):
+        RunLog(copy).receipt({"round": 3}, {})
+    assert {p: p.read_bytes() for p in copy.rglob("*.json*")} == before
+
+
+def test_an_evaluation_after_the_end_leaves_the_records_alone(tmp_path: Path) -> None:
+    run = toy_trainer(tmp_path, max_steps=1)
+    run.train()
+    head = file_digest(tmp_path / "seal.json")
+    assert "eval_reward" in run.evaluate(Dataset.from_list(task_rows(toy_tasks(1))))
+    assert file_digest(tmp_path / "seal.json") == head and violations(tmp_path, head=head) == []
 
 
 def test_updates_deleted_together_with_the_seal_leave_traces(copy: Path) -> None:
@@ -281,25 +331,39 @@ def test_what_no_completion_can_be() -> None:
     assert "3 tokens, 2 log-probabilities" in problems(logprobs=[-0.5, 0.0])
 
 
+def _rows(advantages: Sequence[float]) -> list[Row]:
+    return [Row(build_sequences(episode([call(0, [1], [5])]))[0], a, i) for i, a in enumerate(advantages)]
+
+
 @pytest.mark.parametrize(("estimator", "told"), [("grpo", True), ("gigpo", False)])
 def test_advantages_sum_to_zero_where_the_estimator_says_so(estimator: str, told: bool) -> None:
     """Two rollouts with advantages 1 and -0.5: the sum is 0.5."""
-    episodes = [episode([call(0, [1], [5])]) for _ in range(2)]
-    rows = [Row(build_sequences(t)[0], a, i) for i, (t, a) in enumerate(zip(episodes, (1.0, -0.5), strict=True))]
-    finding = UpdateAudit(0)
-    _check_advantages(finding, rows, episodes, CreditRule(2, estimator=estimator))
-    assert bool(finding.violations) is told
-    assert not told or "advantages of group 0 sum to 0.5, not 0" in finding.violations[0]
+    found = list(check_sums(_rows([1.0, -0.5]), [2.0, 0.0], CreditRule(2, estimator=estimator)))
+    assert found == (["advantages of group 0 sum to 0.5, not 0"] if told else [])
 
 
-def test_large_returns_are_not_called_a_violation_for_their_rounding() -> None:
-    """Advantages of +-1e9 that differ in their last digit sum to 1e-7, which is nothing beside them."""
-    episodes = [episode([call(0, [1], [5])]) for _ in range(2)]
-    rows = [Row(build_sequences(t)[0], a, i) for i, (t, a) in enumerate(zip(episodes, (1e9, -1e9 + 1e-7), strict=True))]
-    finding = UpdateAudit(0)
-    _check_advantages(finding, rows, episodes, CreditRule(2, estimator="centred"))
-    _check_samples(finding, rows, episodes)
-    assert finding.violations == []
+@pytest.mark.parametrize("estimator", [name for name, spec in ESTIMATORS.items() if not spec.per_step])
+@pytest.mark.parametrize("size", [1.0, 1e6, 1e9, 1e12])
+def test_large_returns_are_not_called_a_violation_for_their_rounding(estimator: str, size: float) -> None:
+    """A mean of 1e9 is known to 1e-7; where returns differ by 0.001, advantages sum to as much as 1e-4."""
+    returns = [size, size + 0.001, size + 0.0025, size + 0.25]
+    advantages = ESTIMATORS[estimator].function(returns)
+    assert list(check_sums(_rows(advantages), returns, CreditRule(4, estimator=estimator))) == []
+    if size < 1e9 and any(advantages):  # one of the four, a hundredth off
+        advantages[0] *= 1.01
+        assert len(list(check_sums(_rows(advantages), returns, CreditRule(4, estimator=estimator)))) == 1
+
+
+def test_a_small_number_that_was_edited_is_noticed() -> None:
+    """Returns of 1e-6: half of one is no rounding."""
+    assert _equal(1e-6, 1e-6 * (1 + 1e-12)) and _equal(0.0, 1e-15) and _equal(1e9, 1e9 + 1e-7)
+    assert not _equal(1e-6, 1.5e-6) and not _equal(1e9, 1e9 + 100.0) and not _equal(0.0, 1e-9)
+
+
+def test_samples_are_counted_by_their_call() -> None:
+    problems: list[str] = []
+    assert check_samples(_rows([1.0]), [episode([call(0, [1], [5])])], problems) == {"reasoning.direct/act": 1}
+    assert problems == []
 
 
 def test_padding_rows_are_those_of_equal_micro_batches() -> None:
@@ -362,9 +426,12 @@ def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path, capsys: pytest.Ca
     assert "its manifest.json was removed" in refused(str(copy))
 
 
-def test_a_receipt_of_another_version_is_told(copy: Path) -> None:
-    edit(copy / "updates.jsonl", lambda r: [record.pop("chain") and record.pop("format") for record in r] and None)
-    assert any("has format None, expected 3" in v for v in violations(copy))
+def test_records_of_another_version_are_told(copy: Path) -> None:
+    edit(copy / "updates.jsonl", lambda records: [record.pop("format") for record in records] and None)
+    assert any("updates.jsonl, update 1: format is missing" in v for v in violations(copy))
+    edit(copy / "manifest.json", lambda records: records[0].update(format=3))
+    with pytest.raises(SpecError, match="format 3, expected 4; audit it with the version that wrote it"):
+        list(audit(copy))
 
 
 def test_a_line_that_is_being_written_is_left_alone(copy: Path) -> None:
@@ -372,8 +439,9 @@ def test_a_line_that_is_being_written_is_left_alone(copy: Path) -> None:
     with open(copy / "updates.jsonl", "a", encoding="utf-8") as file:
         file.write('{"round": 3, "epi')
     before = (copy / "updates.jsonl").read_bytes()
-    assert [r.round for r in audit(copy)] == [0, 1, 2]
+    assert [r.round for r in audit(copy) if r.round is not None] == [0, 1, 2]
     assert (copy / "updates.jsonl").read_bytes() == before
+    (copy / "seal.json").unlink()
     RunLog(copy).receipt({"round": 3}, {})
     assert [r["round"] for r in RunLog(copy).read("updates.jsonl")] == [0, 1, 2, 3]
 

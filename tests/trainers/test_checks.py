@@ -107,11 +107,14 @@ def test_a_field_that_nobody_reads_is_refused(tmp_path: Path, name: str) -> None
         ({"off_policy_mask_threshold": 0.5}, "per row"),
         ({"entropy_coef": 0.01}, "no gradient"),
         ({"use_adaptive_entropy": True}, "no gradient"),
-        ({"adapter": "smollm2-135m-courier", "lora_r": 64}, "lora_r is 64 beside adapter"),
-        ({"adapter": "smollm2-135m-courier", "lora_layers": 2}, "lora_layers is 2 beside adapter"),
-        ({"adapter": "smollm2-135m-courier", "lora_targets": ["q_proj"]}, "lora_targets is ['q_proj'] beside adapter"),
+        ({"adapter": "smollm2-135m-courier", "lora_r": 64}, "lora_r is 64, which changes nothing: beside adapter"),
+        ({"adapter": "smollm2-135m-courier", "lora_layers": 2}, "lora_layers is 2, which changes nothing: beside"),
+        ({"adapter": "smollm2-135m-courier", "lora_targets": ["q_proj"]}, "lora_targets is ['q_proj'], which changes"),
         ({"agent": {"reasoning": {"name": "tot", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
         ({"agent": {"reasoning": {"name": "rap", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
+        ({"agent": {"reasoning": {"name": "rap", "temperature": math.inf}}}, "temperature is inf"),
+        ({"agent": {"sampling": {"temperature": math.inf}}}, "temperature=inf"),
+        ({"rewards": {}}, "rewards is {}, which pays nothing"),
     ],
 )
 def test_a_setting_without_effect_says_where_it_is_set(tmp_path: Path, changes: dict[str, Any], remedy: str) -> None:
@@ -165,6 +168,18 @@ def test_where_logs_go_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
         {"lora_r": 0, "lora_alpha": 32},
         {"mask_truncated": ["memory.nothing"]},
         {"validation_specs": [{"reasoning": "cot"}]},
+        {"validation_tasks": 4},
+        {"vllm_mode": "server"},
+        {"vllm_importance_sampling_correction": False},
+        {"vllm_importance_sampling_clip_max": 2.0},
+        {"vllm_importance_sampling_clip_min": 0.5},
+        {"vllm_importance_sampling_mode": "token_mask"},
+        {"vllm_gpu_memory_utilization": 0.5},
+        {"vllm_server_port": 9000},
+        {"vllm_batch_invariant": True},
+        {"use_vllm": True, "vllm_importance_sampling_correction": False, "vllm_importance_sampling_clip_max": 2.0},
+        {"use_vllm": True, "vllm_server_port": 9000},
+        {"use_vllm": True, "vllm_mode": "server", "vllm_max_model_length": 512},
     ],
     ids=str,
 )
@@ -187,6 +202,9 @@ def test_a_setting_that_nobody_would_read_is_refused(tmp_path: Path, changes: di
         {"num_iterations": 0},
         {"tokens_per_forward": -1},
         {"lora_layers": -1},
+        {"env_timeout_s": 0.0},
+        {"env_timeout_s": math.inf},
+        {"eval_strategy": "steps", "eval_steps": 500, "validation_tasks": 0},
     ],
     ids=str,
 )
@@ -211,4 +229,4 @@ def test_a_weight_that_is_no_number_is_refused(tmp_path: Path) -> None:
 
 def test_a_cap_below_1_is_told(tmp_path: Path) -> None:
     told = [n for n in notes(config(tmp_path, loss_type="cispo")) if "epsilon_high 0.2" in n]
-    assert len(told) == 1 and not notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0))
+    assert len(told) == 1 and not list(notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,6 +16,7 @@ import torch
 pytest.importorskip("trl")
 
 from peft import LoraConfig, get_peft_model
+from trl import GRPOTrainer
 from trl.generation.vllm_client import VLLMClient
 from trl.generation.vllm_generation import VLLMGeneration
 
@@ -119,6 +121,19 @@ def test_what_vllm_samples_otherwise_is_weighed(tmp_path: Path, trainer: Any) ->
         torch.testing.assert_close(step(name, **changes), factor * plain, atol=2e-6, rtol=1e-3)
 
 
+def test_trl_s_figures_of_vllm_are_logged_under_its_names(tmp_path: Path, trainer: Any) -> None:
+    trainer(tmp_path, max_steps=1, bias=-0.6931472).train()
+    (metrics,) = (r for r in RunLog(tmp_path).read("metrics.jsonl") if "reward" in r)
+    stock = re.findall(r'"(sampling/[\w/]+)"', inspect.getsource(GRPOTrainer._generate_and_score_completions))
+    assert len(stock) == 5 and set(stock) <= set(metrics)
+    # Every token was reported ln 2 less likely than it is: a ratio of 2.
+    for name in stock:
+        assert metrics[name] == pytest.approx(0.6931472 if "difference" in name else 2.0, abs=1e-3), name
+    trainer(tmp_path / "off", max_steps=1, vllm_importance_sampling_correction=False).train()
+    (metrics,) = (r for r in RunLog(tmp_path / "off").read("metrics.jsonl") if "reward" in r)
+    assert not set(stock) & set(metrics) and "sampling/logp_difference_max" in metrics
+
+
 def test_importance_ratio() -> None:
     logps = torch.tensor([[0.0, -1.0, -2.0, 0.0]], requires_grad=True)
     sampled = torch.tensor([[0.0, -2.0, -1.0, -90.0]])
@@ -147,7 +162,7 @@ def test_what_cannot_work_with_vllm_is_refused(tmp_path: Path, trainer: Any) -> 
     for changes, reason in (
         ({"vllm_tensor_parallel_size": 2}, "vllm_mode: server"),
         ({"vllm_importance_sampling_mode": "sequence_mask"}, "speaks of rows"),
-        ({"vllm_batch_invariant": True, "use_vllm": False}, "without vLLM"),
+        ({"vllm_batch_invariant": True, "use_vllm": False}, "set `use_vllm: true`"),
         ({"vllm_batch_invariant": True, "vllm_mode": "server"}, "VLLM_BATCH_INVARIANT=1 vllm serve"),
         ({"vllm_batch_invariant": True}, "no CUDA device"),
     ):

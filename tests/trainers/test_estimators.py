@@ -92,10 +92,23 @@ def test_reward_to_go_baseline_per_step() -> None:
 def test_an_ended_rollout_earns_nothing_more() -> None:
     # To go: [2], [0, 4] gives [4, 4]; means: step 0 (2 + 4) / 2 = 3, step 1 (0 + 4) / 2 = 2.
     got = reward_to_go([[2.0], [0.0, 4.0]])
-    # Centred [-1], [1, 2]: deviation sqrt(6 / 2) = 1.732.
-    assert close(got, [[-0.577], [0.577, 1.155]])
+    # Centred [-1], [1, 2]: mean 2/3, deviation sqrt((25 + 1 + 16) / 9 / 2) = 1.5275.
+    assert close(got, [[-0.655], [0.655, 1.309]])
     assert reward_to_go([[1.0, 2.0]]) == [[0.0, 0.0]] and reward_to_go([]) == []
     assert reward_to_go([[1.0], [1.0]]) == [[0.0], [0.0]]
+
+
+def test_the_deviation_of_ragged_groups_is_about_their_mean() -> None:
+    """To go [4], [0, 0], [2, 1]: means 2 and (0 + 0 + 1) / 3, so that the five values centred do not sum to zero.
+
+    They are 2, -2, -1/3, 0, 2/3, of mean 1/15: squares about it sum to 77/9 - 5/225 = 128/15, of which 1/4 is 32/15.
+    """
+    got = reward_to_go([[4.0], [0.0, 0.0], [1.0, 1.0]])
+    divisor = math.sqrt(32 / 15) + 1e-4
+    expected = [[2.0], [-2.0, -1 / 3], [0.0, 2 / 3]]
+    assert [len(g) for g in got] == [1, 2, 2]
+    for values, centred in zip(got, expected, strict=True):
+        assert values == pytest.approx([v / divisor for v in centred], rel=1e-12, abs=1e-15)
 
 
 def test_gigpo_compares_actions_taken_in_the_same_state() -> None:

@@ -105,11 +105,11 @@ def test_the_entropy_bonus_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"delta": 2.0, "loss_type": "cispo"}, "delta 2.0 changes nothing with loss_type 'cispo'"),
-        ({"gamma": 0.9}, "gamma 0.9 changes nothing with estimator 'grpo'"),
-        ({"gigpo_weight": 0.5, "estimator": "reward_to_go"}, "use one that reads it: gigpo"),
+        ({"delta": 2.0, "loss_type": "cispo"}, "delta is 2.0, which changes nothing: loss_type 'cispo' does not"),
+        ({"gamma": 0.9}, "gamma is 0.9, which changes nothing: estimator 'grpo' does not read it"),
+        ({"gigpo_weight": 0.5, "estimator": "reward_to_go"}, "does not read it; use gigpo"),
         ({"reference": "bse"}, "unknown reference"),
-        ({"max_completion_length": 50}, "which only loss_type 'dr_grpo' reads"),
+        ({"max_completion_length": 50}, "only loss_type 'dr_grpo' reads it"),
     ],
 )
 def test_settings_that_change_nothing_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

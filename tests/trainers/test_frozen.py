@@ -17,6 +17,7 @@ from tests.tiny import tiny_model, tiny_tokenizer
 from tests.trainers.test_tree import forked_rows, gradients
 from trainers.forward import frozen_output, rows_logprobs
 from trainers.frozen import frozen_layers, layer_above
+from trainers.runlog import RunLog
 from trainers.sequences import Row, TokenSequence
 from trainers.tree.model import enable_tree
 
@@ -178,3 +179,26 @@ def test_rollouts_leave_what_an_update_starts_from() -> None:
         assert float((x - y).norm()) <= 1e-5 * float(x.norm())
     recorder.clear()
     assert recorder.find(rows[0].sequence.tokens[:-1]) is None
+
+
+@pytest.mark.parametrize("changes", [{}, {"beta": 0.1}, {"num_iterations": 2}, {"packing": "padded"}], ids=str)
+def test_a_run_is_the_one_that_starts_from_the_first_layer(tmp_path: Any, monkeypatch: Any, changes: Any) -> None:
+    import trainers.grpo
+    from tests.trainers import played
+
+    monkeypatch.setattr(played, "tiny_model", lambda tokenizer: upper_lora("padded"))
+    updates = []
+    for name in ("frozen", "whole"):
+        if name == "whole":
+            monkeypatch.setattr(trainers.grpo, "frozen_layers", lambda model: [])
+        run = played.toy_trainer(tmp_path / name, max_steps=1, rewards={"env": 1.0}, **changes)
+        assert len(run._frozen) == (2 if name == "frozen" else 0)
+        run.train()
+        # Only a round that is one update starts from what its rollouts left.
+        assert (run._recorder is not None) == (name == "frozen" and "num_iterations" not in changes)
+        assert (run._below is not None) == (name == "frozen")
+        updates += RunLog(tmp_path / name).read("metrics.jsonl")
+    frozen, whole = updates
+    assert whole["grad_norm"] > 0
+    for figure in ("grad_norm", "loss", "entropy"):
+        assert frozen[figure] == pytest.approx(whole[figure], rel=1e-5, abs=1e-6)

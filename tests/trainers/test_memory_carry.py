@@ -13,17 +13,20 @@ from datasets import Dataset
 
 from agentspec.carry import FILE, MemoryBank, save_bank, start_bank
 from agentspec.episode import Job
+from agentspec.files import digest
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
 from tests.trainers.builders import CPU_RUN
+from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.retroformer import as_retroformer
 from trainers.rollouts import rollout_jobs, starting_states, task_rows
+from trainers.run_folder import last_complete_checkpoint
 from trainers.runlog import RunLog
 
 TASKS = [Task(TOY, seed, {"steps": 3, "menu": True}) for seed in range(2)]
@@ -99,6 +102,20 @@ def test_the_memories_lie_beside_the_run_and_start_another(tmp_path: Path) -> No
     other = trainer(tmp_path / "other", start_memory=str(tmp_path / "grown"), max_steps=1)
     other.train()
     assert {j.task.key: j.memory_state for j in other.rounds[0][0]} == {t.key: bank.of(t) for t in TASKS}
+
+
+def test_a_resumed_run_has_the_memories_of_its_checkpoint_until_it_writes_others(tmp_path: Path) -> None:
+    """What is carried belongs to a receipt: of the last one, whatever the killed run had written beyond."""
+    trainer(tmp_path, save_strategy="steps", save_steps=1).train()
+    receipts = RunLog(tmp_path).read("updates.jsonl")
+    assert digest((tmp_path / FILE).read_bytes()) == receipts[-1]["chain"]["memory"] != receipts[0]["chain"]["memory"]
+    again = trainer(tmp_path, save_strategy="steps", save_steps=1)
+    with again._recorded(str(tmp_path / "checkpoint-1")):
+        assert digest((tmp_path / FILE).read_bytes()) == receipts[0]["chain"]["memory"]
+        assert [v for r in audit(tmp_path) for v in r.violations] == []
+        assert last_complete_checkpoint(tmp_path) == tmp_path / "checkpoint-1"  # not one whose records are gone
+    (tmp_path / FILE).unlink()
+    assert any(FILE in v for r in audit(tmp_path) for v in r.violations)
 
 
 def test_rollouts_of_a_task_start_alike() -> None:

@@ -26,7 +26,7 @@ from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import ScaffoldState, load_state, save_state
 from trainers.rollouts import task_rows
-from trainers.run_folder import checkpoints, last_complete_checkpoint
+from trainers.run_folder import LOCK, checkpoints, last_complete_checkpoint
 from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
@@ -125,11 +125,11 @@ def test_a_finished_run_takes_no_step_more(tmp_path: Path) -> None:
 
 
 def _files(folder: Path) -> dict[str, bytes]:
-    """Every file below a run's folder."""
+    """Every file below a run's folder but its lock."""
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in sorted(folder.rglob("*"))
-        if p.is_file() and "earlier" not in p.relative_to(folder).parts
+        if p.is_file() and p.name != LOCK and "earlier" not in p.relative_to(folder).parts
     }
 
 
@@ -175,6 +175,34 @@ def test_a_second_run_into_a_live_folder_is_refused(tmp_path: Path, monkeypatch:
     assert [(r.round, r.violations) for r in audit(tmp_path)] == [(0, [])]
 
 
+def test_a_second_resume_into_a_live_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two that take up the same interrupted run: the second would drop what the first has written since."""
+    first = trainer(tmp_path)
+    first.add_callback(_stop_after(2))
+    first.train()
+    one, two = trainer(tmp_path), trainer(tmp_path)
+    play, refusals, seen = one._play, [], []
+
+    def intruded(*args: Any, **kwargs: Any) -> Any:
+        before = _files(tmp_path)
+        thread = threading.Thread(target=intrude)
+        thread.start()
+        thread.join()
+        seen.append(_files(tmp_path) == before)
+        return play(*args, **kwargs)
+
+    def intrude() -> None:
+        try:
+            two.train(resume_from_checkpoint=True)
+        except SpecError as error:
+            refusals.append(str(error))
+
+    monkeypatch.setattr(one, "_play", intruded)
+    one.train(resume_from_checkpoint=True)
+    assert seen == [True, True] and len(refusals) == 2 and all("under way" in r for r in refusals)
+    assert [(r.round, r.violations, r.notes) for r in audit(tmp_path)] == [(n, [], []) for n in range(4)]
+
+
 def test_a_resumed_run_keeps_its_earlier_manifest(tmp_path: Path) -> None:
     """Receipts from before name it; what the resumed run writes names the new one, which names the old."""
     first = trainer(tmp_path)
@@ -198,7 +226,7 @@ def test_episodes_that_a_resumed_run_plays_again_leave_no_trace(
         killed.train()
     assert (tmp_path / "trajectories" / "000002.jsonl").is_file()
     (cut,) = [r for r in audit(tmp_path) if r.notes]
-    assert "has not ended" in cut.notes[0] and cut.violations == []  # a round under way
+    assert "under way after update 1" in cut.notes[0] and cut.violations == []  # a round under way
     trainer(tmp_path, max_steps=2).train(resume_from_checkpoint=True)
     assert sorted(p.name for p in (tmp_path / "trajectories").iterdir()) == ["000000.jsonl", "000001.jsonl"]
     assert [(r.violations, r.notes) for r in audit(tmp_path)] == [([], [])] * 2

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from agentspec.registry import SpecError
-from trainers import folder_lock
-from trainers.folder_lock import LOCK, hold
-from trainers.run_folder import checkpoints, holds_run, last_complete_checkpoint, set_aside
+from trainers import run_folder
+from trainers.run_folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
 
 HOLDER = """
 import sys
-from trainers.folder_lock import hold
+from trainers.run_folder import hold
 with hold(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -47,10 +44,9 @@ def test_a_folder_in_use_is_refused_until_its_holder_is_gone(tmp_path: Path, els
         pass
     elsewhere.kill()  # it cannot take its lock away
     elsewhere.wait()
-    assert (tmp_path / LOCK).is_file()
+    assert str(elsewhere.pid) in (tmp_path / LOCK).read_text()
     with hold(tmp_path):
-        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
-    assert not (tmp_path / LOCK).exists()
+        assert (tmp_path / LOCK).read_text().startswith(f"process {os.getpid()} on ")
 
 
 def test_the_holder_may_hold_it_again_and_another_thread_may_not(tmp_path: Path) -> None:
@@ -72,47 +68,25 @@ def test_the_holder_may_hold_it_again_and_another_thread_may_not(tmp_path: Path)
     assert refused[1] == ""
 
 
-def _leave(folder: Path, age_s: float = 0.0, **changes: Any) -> None:
-    """A lock file that somebody left."""
-    path = folder / LOCK
-    path.write_text(json.dumps(folder_lock._me() | changes))
-    then = time.time() - age_s
-    os.utime(path, (then, then))
-
-
-def _taken(folder: Path) -> bool:
-    try:
-        with hold(folder):
-            return True
-    except SpecError:
-        return False
-
-
-def test_a_stale_lock_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # The operating system knows that no process of this machine holds it.
-    _leave(tmp_path)
-    assert _taken(tmp_path)
-    # Another machine, or this one before it was started anew: a holder refreshes its lock every 30 s.
-    _leave(tmp_path, machine="another")
-    assert not _taken(tmp_path)
-    _leave(tmp_path, machine="another", age_s=folder_lock.STALE_S + 5)
-    assert _taken(tmp_path)
-    (tmp_path / LOCK).write_text("{damaged")
-    assert _taken(tmp_path)
-    # No locks of the operating system here: the time alone tells.
-    monkeypatch.setattr(folder_lock, "fcntl", None)
-    _leave(tmp_path)
-    assert not _taken(tmp_path)
-    _leave(tmp_path, age_s=folder_lock.STALE_S + 5)
-    assert _taken(tmp_path)
-
-
-def test_a_holder_refreshes_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    beaten = threading.Event()
-    monkeypatch.setattr(folder_lock, "BEAT_S", 0.0)
-    monkeypatch.setattr(folder_lock.os, "utime", lambda path: beaten.set())
+def test_a_lock_that_was_left_behind_holds_nobody(tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text("process 1 on another")
     with hold(tmp_path):
-        assert beaten.wait(60)
+        assert f"process {os.getpid()} on " in (tmp_path / LOCK).read_text()
+    assert (tmp_path / LOCK).read_text() == ""
+
+
+def test_where_nothing_can_be_locked_a_run_goes_on_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(38, "Function not implemented")
+
+    for change in ((run_folder, "fcntl", None), (run_folder.fcntl, "flock", refuse)):
+        with monkeypatch.context() as patched:
+            patched.setattr(*change)
+            with hold(tmp_path):
+                pass
+        assert "cannot be locked here; see that no second run writes" in capsys.readouterr().err
 
 
 # --- setting aside ---------------------------------------------------------------------------------------------------

@@ -316,10 +316,10 @@ def test_a_resumed_run_plays_the_same_re_rolls(tmp_path: Path) -> None:
         ({"write_credit": "locall"}, "unknown write_credit 'locall'"),
         ({"write_credit": "ablation", "train_calls": ["reasoning.*"]}, "is both trained"),
         ({"write_credit": "local", "write_calls": ["memory.*/other"]}, "is both trained"),
-        ({"write_rerolls": 3}, "write_rerolls 3 changes nothing with write_credit 'episode'"),
-        ({"write_credit": "ablation", "write_points": 3}, "write_points 3 changes nothing"),
-        ({"write_credit": "local", "write_rerolls": 0}, "expected at least 1"),
-        ({"write_calls": ["memory.cheat_sheet"]}, "changes nothing with write_credit 'episode'"),
+        ({"write_rerolls": 3}, "write_rerolls is 3, which changes nothing: set `write_credit: local`"),
+        ({"write_credit": "ablation", "write_points": 3}, "write_points is 3, which changes nothing"),
+        ({"write_credit": "local", "write_rerolls": 0}, "expected a number of at least 1"),
+        ({"write_calls": ["memory.cheat_sheet"]}, "which changes nothing: write_credit is 'episode'"),
     ],
 )
 def test_what_would_credit_nothing_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -18,23 +18,19 @@ from typing import Any, ClassVar, Literal
 
 from agentspec.envs.alfred import menu
 from agentspec.envs.alfred.goals import Changes, Progress, progress
+from agentspec.envs.alfred.listing import in_view, worded
 from agentspec.envs.alfred.own import own_trial
+from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import PAPER, Trial, read_trial, trial_path
-from agentspec.envs.thor.engine import OfflineThor, Settings
 from agentspec.envs.thor.game import Game, Told, check
 from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
-from agentspec.envs.thor.names import Names, direction, whereabouts
-from agentspec.envs.thor.protocol import Event, Thor
+from agentspec.envs.thor.names import Names
+from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Scene, cell_at
-from agentspec.envs.thor.sight import AGENT_HEIGHT, Camera
 from agentspec.envs.thor.ways import way_to_see
 from agentspec.metrics import Metric
 from agentspec.types import Action, ActionSchema
-
-SETTINGS = Settings(look_step=15.0, horizon=(-30.0, 60.0), camera=Camera(AGENT_HEIGHT, 60.0))
-"""ALFRED's: 0.25 m, 90 degrees, 15 degrees, 300 x 300 pixels, 1.5 m. Camera height and field of view are the build's
-defaults; they also explain best where the recorded pictures show the objects that experts pick up."""
 
 RULES = """You act in a room of a house, one action at a time. Only objects within 1.5 m that the camera shows can be \
 used; you see them listed. Moves are 0.25 m, turns 90 degrees, the camera looks up or down by 15 degrees.
@@ -63,7 +59,7 @@ class AlfredEnv(Game):
         images: put the egocentric picture into the observation, uint8 (300, 300, 3).
         render_mode: None or "rgb_array".
         player: `offline`, or `ai2thor`: the simulator, version 2.1.0.
-        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/thor.md).
 
     Raises:
         ValueError: an argument that is none of these.
@@ -200,14 +196,14 @@ class AlfredEnv(Game):
     # -- reporting ---------------------------------------------------------------------------------------------
 
     def _describe(self) -> dict[str, Any]:
-        listed = self._listed()
+        listed = in_view(self.event.metadata, self.names)
         held = self.event.metadata["inventoryObjects"]
         holding = self.names.name(held[0]["objectId"]) if held else ""
         agent = self.event.metadata["agent"]
         lines = [
             f"Step {self.steps} of {self.max_steps}. You hold {holding or 'nothing'}. The camera looks "
             f"{agent['cameraHorizon']:g} deg down.",
-            "In view within 1.5 m: " + ("; ".join(map(_worded, listed)) or "nothing") + ".",
+            "In view within 1.5 m: " + ("; ".join(map(worded, listed)) or "nothing") + ".",
         ]
         if self.told.message or self.told.error:
             lines.insert(0, f"Last: {self.told.message or self.told.error}.")
@@ -236,28 +232,6 @@ class AlfredEnv(Game):
             "goal_conditions": self.progress.share,
         }
 
-    def _listed(self) -> list[dict[str, Any]]:
-        """The objects in view, nearest first."""
-        seen = []
-        agent = self.event.metadata["agent"]
-        for one in self.event.metadata["objects"]:
-            if one["visible"] and not one["isPickedUp"]:
-                far, bearing = whereabouts(one, agent)
-                told: dict[str, Any] = {
-                    "name": self.names.name(one["objectId"]),
-                    "objectId": one["objectId"],
-                    "distance": round(far, 2),
-                    "bearing": bearing,
-                }
-                if one["openable"] and not one["pickupable"]:
-                    told["isOpen"] = one["isOpen"]
-                if one["toggleable"]:
-                    told["isToggled"] = one["isToggled"]
-                if one["pickupable"] and one["parentReceptacles"]:
-                    told["in"] = self.names.name(one["parentReceptacles"][0])
-                seen.append(told)
-        return sorted(seen, key=lambda t: (t["distance"], t["name"]))
-
     def _metrics(self) -> dict[str, Any]:
         now = self.progress
         found: dict[str, Any] = {
@@ -284,48 +258,6 @@ class AlfredEnv(Game):
         self.changes = Changes(**{k: set(v) for k, v in records["changes"].items()})
         self.names, self.known = Names(records["names"]), set(records["known"])
         self._look(self.world.observe())
-
-
-def start(trial: Trial, scene: Scene, settings: Settings = SETTINGS) -> OfflineThor:
-    """An offline world set up for a trial; raises as `set_up`."""
-    world = OfflineThor(scene, settings)
-    set_up(world, trial)
-    return world
-
-
-def set_up(world: Thor, trial: Trial) -> None:
-    """Bring a world to where a trial starts, in ALFRED's order: dirt, switches, objects, the agent.
-
-    Raises:
-        ValueError: the trial does not fit the scene.
-    """
-    todo: list[Mapping[str, Any]] = []
-    if trial.dirty:
-        todo += [
-            {"action": "SetStateOfAllObjects", "StateChange": "CanBeDirty"},
-            {"action": "SetStateOfAllObjects", "StateChange": "CanBeFilled"},
-        ]
-    todo += [
-        {"action": "SetObjectToggles", "objectToggles": trial.toggles},
-        {"action": "SetObjectPoses", "objectPoses": trial.poses},
-        trial.start,
-    ]
-    for action in todo:
-        event = world.step(action)
-        if not event.success:
-            raise ValueError(f"trial {trial.id} does not fit scene {trial.scene}: {action['action']}: {event.error}")
-
-
-def _worded(told: Mapping[str, Any]) -> str:
-    notes = []
-    if "isOpen" in told:
-        notes.append("open" if told["isOpen"] else "closed")
-    if "isToggled" in told:
-        notes.append("on" if told["isToggled"] else "off")
-    if "in" in told:
-        notes.append(f"in {told['in']}")
-    extra = f" ({', '.join(notes)})" if notes else ""
-    return f"{told['name']}{extra} {told['distance']} m {direction(told['bearing'])}"
 
 
 @lru_cache(maxsize=1024)

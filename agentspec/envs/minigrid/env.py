@@ -26,7 +26,8 @@ from gymnasium import spaces
 from agentspec.actions import parse_action
 from agentspec.envs.minigrid.search import ACTIONS, optimum
 from agentspec.envs.minigrid.suites import Layout, layout_of
-from agentspec.envs.minigrid.view import TEXTS, Thing, View, compact, look
+from agentspec.envs.minigrid.texts import TEXTS, compact
+from agentspec.envs.minigrid.view import Thing, View, look
 from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema, ActionSpec
 

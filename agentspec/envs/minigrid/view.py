@@ -1,11 +1,7 @@
 """What an agent sees of a grid, in words: everything from the 7 x 7 cells in front of it, nothing else.
 
-`look` reads the cells that MiniGrid's own partial observation shows (walls occlude) into a `View`; three texts are made
-of it:
-
-- `compact`: one short line per aspect, at most 80 tokens of a small model's vocabulary on the suites offered;
-- `basic`: sentences, one per thing seen;
-- `relational`: what the cell ahead affords, objects by distance, walls to the sides, and a character map.
+`look` reads the cells that MiniGrid's own partial observation shows (walls occlude) into a `View`, of which `texts`
+makes words.
 
 Distances are steps: "2 forward, 1 left". Unseen cells are never described.
 """
@@ -30,10 +26,7 @@ MARKS = {
     **{"door": "D", "key": "K", "ball": "O", "box": "B", "goal": "G"},
 }
 """Characters of the relational map; the agent is `^`, an open door `_`."""
-LEGEND = "you are ^ and look up; # wall, . free, ? unseen, D door, _ open door, K key, O ball, B box, G goal, L lava"
 PLAIN = frozenset({"unseen", "empty", "wall", "floor", "agent"})
-MOST_SHOWN = 3
-"""Things, or rows of equal things, that the compact text names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +113,31 @@ class View:
 
 
 def look(world: Any) -> View:
-    """What the agent of a running MiniGrid environment (`env.unwrapped`) sees.
+    """What the agent of a running MiniGrid environment (`env.unwrapped`) sees."""
+    rows, things = _read(world)
+    middle = world.agent_view_size // 2
+    ahead = Thing("wall", "", "", 1, 0) if len(rows) > 1 and rows[1][middle] == "wall" else None
+    for thing in things:
+        if thing.forward == 1 and thing.right == 0:
+            ahead = thing
+    carried = world.carrying
+    return View(
+        mission=world.mission,
+        heading=HEADINGS[int(world.agent_dir)],
+        carrying=f"{carried.color} {carried.type}" if carried else "",
+        ahead=ahead,
+        things=tuple(things),
+        walls=(
+            _wall([row[middle] for row in rows[1:]]),
+            _wall(rows[0][middle - 1 :: -1]),
+            _wall(rows[0][middle + 1 :]),
+        ),
+        cells=tuple(map(tuple, rows)),
+    )
+
+
+def _read(world: Any) -> tuple[list[list[str]], list[Thing]]:
+    """Types of the cells in view by rows, and the things among them, nearest first.
 
     The same cells as in MiniGrid's own partial observation (`gen_obs`), read from the grid row by row: sight goes
     forward, and to the sides and diagonals from every cell that lets it through.
@@ -159,25 +176,7 @@ def look(world: Any) -> View:
         rows.append(row)
         if not lit:
             break
-    things.sort(key=_nearness)
-    ahead = Thing("wall", "", "", 1, 0) if len(rows) > 1 and rows[1][middle] == "wall" else None
-    for thing in things:
-        if thing.forward == 1 and thing.right == 0:
-            ahead = thing
-    carried = world.carrying
-    return View(
-        mission=world.mission,
-        heading=HEADINGS[int(world.agent_dir)],
-        carrying=f"{carried.color} {carried.type}" if carried else "",
-        ahead=ahead,
-        things=tuple(things),
-        walls=(
-            _wall([row[middle] for row in rows[1:]]),
-            _wall(rows[0][middle - 1 :: -1]),
-            _wall(rows[0][middle + 1 :]),
-        ),
-        cells=tuple(map(tuple, rows)),
-    )
+    return rows, sorted(things, key=_nearness)
 
 
 @functools.lru_cache(maxsize=1 << 14)
@@ -213,95 +212,3 @@ def _wall(ray: Sequence[str]) -> int:
         if kind not in ("empty", "floor"):
             return steps if kind == "wall" else 0
     return 0
-
-
-def compact(view: View, last: str = "") -> str:
-    """The shortest text that a good player needs; cells of one kind in a row or a column are named together."""
-    front = view.ahead.name if view.ahead else "nothing"
-    carrying = f", carrying {view.carrying}" if view.carrying else ""
-    lines = [f"Mission: {view.mission}."]
-    if last:
-        lines.append(f"Last: {last}.")
-    lines.append(f"Facing {view.heading}{carrying}. In front: {front}.")
-    others = [t for t in view.things if (t.forward, t.right) != (1, 0)]
-    if others:
-        lines.append(f"In view: {'; '.join(_runs(others)[:MOST_SHOWN])}.")
-    sides = zip(view.walls, ("forward", "left", "right"), strict=True)
-    walls = ", ".join(f"{steps} {side}" for steps, side in sides if steps)
-    return "\n".join([*lines, f"Walls: {walls}."] if walls else lines)
-
-
-def _runs(things: Sequence[Thing]) -> list[str]:
-    """Names and places, nearest first; neighbours with one name become "lava 2 forward, 3 left to 1 right"."""
-    left = list(things)
-    said = []
-    while left:
-        first = left.pop(0)
-        same = {(t.forward, t.right): t for t in left if t.name == first.name}
-        best: list[Thing] = []
-        for step in ((0, 1), (1, 0)):
-            run = [first]
-            for sign in (1, -1):
-                place = (first.forward + sign * step[0], first.right + sign * step[1])
-                while place in same:
-                    run.append(same[place])
-                    place = (place[0] + sign * step[0], place[1] + sign * step[1])
-            if len(run) > len(best):
-                best = sorted(run, key=lambda t: (t.forward, t.right))
-        left = [t for t in left if t not in best]
-        said.append(f"{first.name} {_span(best)}")
-    return said
-
-
-def _span(run: Sequence[Thing]) -> str:
-    """Place of one thing, or of a straight row of them."""
-    a, b = run[0], run[-1]
-    if a == b:
-        return a.place
-    if a.forward == b.forward:
-        ends = [f"{abs(t.right)} {'right' if t.right > 0 else 'left'}" if t.right else "straight" for t in (a, b)]
-        return f"{a.forward} forward, {ends[0]} to {ends[1]}"
-    side = f", {abs(a.right)} {'right' if a.right > 0 else 'left'}" if a.right else ""
-    return f"{a.forward} to {b.forward} forward{side}"
-
-
-def basic(view: View, last: str = "") -> str:
-    """One sentence per thing seen."""
-    lines = [f"Your mission: {view.mission}."]
-    if last:
-        lines.append(f"Your last action: {last}.")
-    lines.append(f"You face {view.heading}. You carry {_article(view.carrying) if view.carrying else 'nothing'}.")
-    for steps, side in zip(view.walls, ("in front of you", "to your left", "to your right"), strict=True):
-        if steps:
-            lines.append(f"There is a wall {_steps(steps)} {side}.")
-    lines += [f"There is {_article(thing.name)} at {thing.place}." for thing in view.things]
-    return "\n".join(lines)
-
-
-def relational(view: View, last: str = "") -> str:
-    """What the front cell affords, objects by distance, and the map."""
-    front = view.ahead.name if view.ahead else "empty"
-    lines = [f"Mission: {view.mission}."]
-    if last:
-        lines.append(f"Last action: {last}.")
-    lines += [
-        f"Heading: {view.heading}. Carrying: {view.carrying or 'nothing'}.",
-        f"Cell in front: {front} (you can: {', '.join(view.affordances) or 'not enter it'}).",
-        "Objects, nearest first:" if view.things else "No objects in view.",
-        *(f"- {thing.name}: {thing.place} ({_steps(thing.distance)} away)" for thing in view.things),
-        f"Map ({LEGEND}):",
-        *view.rows,
-    ]
-    return "\n".join(lines)
-
-
-TEXTS = {"compact": compact, "basic": basic, "relational": relational}
-"""Text variant -> function of a `View` and what the last action did."""
-
-
-def _article(name: str) -> str:
-    return f"{'an' if name[:1] in 'aeiou' else 'a'} {name}"
-
-
-def _steps(count: int) -> str:
-    return f"{count} step{'' if count == 1 else 's'}"

@@ -13,50 +13,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
+from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor import homes, mining
-from agentspec.envs.thor.engine import Settings
 from agentspec.envs.thor.game import Game, Told, check
 from agentspec.envs.thor.names import Names, direction, whereabouts, words
 from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Scene
-from agentspec.envs.thor.sight import ROBOT_HEIGHT, Camera
 from agentspec.metrics import Metric
 from agentspec.types import Action, ActionSchema, ActionSpec
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How it is played: the player's settings and the budget."""
-
-    settings: Settings
-    max_steps: int
-
-
-def _preset(turn: float, fov: float, reach: float, steps: int, grid: float = 0.25, size: Any = (300, 300)) -> Preset:
-    camera = Camera(ROBOT_HEIGHT, fov, size[0] / size[1])
-    settings = Settings(
-        grid=grid,
-        rotate_step=turn,
-        horizon=(-30.0, 60.0),
-        visibility=reach,
-        width=size[0],
-        height=size[1],
-        camera=camera,
-        slack=reach,
-    )
-    return Preset(settings, steps)
-
-
-PRESETS: dict[str, Preset] = {
-    "paper": _preset(90.0, 90.0, 1.5, 200),
-    "challenge2021": _preset(30.0, 63.453, 1.0, 500, size=(640, 480)),
-    "casestudy": _preset(45.0, 90.0, 1.5, 200, grid=0.5),
-}
 
 CALLS = {
     "MOVE_AHEAD": ("MoveAhead", "move ahead", "moved ahead"),
@@ -85,12 +53,12 @@ class RoboThorEnv(Game):
         objects: folder with recorded object metadata; default: `objects` two folders above `data`.
         action_mode: `native` calls, or a `menu` of six phrases.
         reward: `success` (1 for it) or `progress` (besides, metres come nearer to the target over the shortest path's
-            length, clipped to -1..1).
+            length, clipped by the metres moved).
         max_steps: instead of the preset's.
         images: put the egocentric picture into the observation.
         render_mode: None or "rgb_array".
         player: `offline`, or `ai2thor`: the simulator, version 5.0.0.
-        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/household.md).
+        executable: for `ai2thor`: a program instead of ai2thor's build, or `standin` (see docs/thor.md).
 
     Raises:
         ValueError: an argument that is none of these.
@@ -185,7 +153,7 @@ class RoboThorEnv(Game):
         if not self.event.success:
             raise ValueError(f"episode {e.id} does not fit scene {e.scene}: {self.event.error}")
         self.walked, self.won = 0.0, False
-        self.far = self.near = self.left_to_go = self.world.distance(e.target)
+        self.far = self.level = self.left_to_go = self.world.distance(e.target)
         self.names = Names()
         self.names.add(self.event.metadata["objects"])
 
@@ -197,7 +165,10 @@ class RoboThorEnv(Game):
         at = self.event.metadata["agent"]["position"]
         event = self.act({"action": CALLS[call][0]})
         now = event.metadata["agent"]["position"]
-        self.walked += math.hypot(now["x"] - at["x"], now["z"] - at["z"])
+        moved = math.hypot(now["x"] - at["x"], now["z"] - at["z"])
+        self.walked += moved
+        if self.level is not None and self.left_to_go is not None:
+            self.level -= max(-moved, min(moved, self.level - self.left_to_go))
         if call == "STOP":
             self.stopped, self.won = True, self._in_view()
         # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
@@ -208,7 +179,6 @@ class RoboThorEnv(Game):
         self.event = super().act(action)
         if str(action["action"]).startswith("Move"):
             self.left_to_go = self.world.distance(self.episode.target)
-            self.near = self.near if self.left_to_go is None else self.left_to_go
         return self.event
 
     def _in_view(self) -> bool:
@@ -219,13 +189,14 @@ class RoboThorEnv(Game):
         return float(self.won) + (self._nearer() if self._reward == "progress" else 0.0)
 
     def _nearer(self) -> float:
-        """Metres come nearer since the start over the shortest path's length (at least 1 m), within -1..1.
+        """Metres come nearer since the start over the shortest path's length (at least 1 m).
 
-        It depends on where the agent is, not on how it got there, so that no loop earns anything.
+        `level`, the metres that are paid for, follows the distance by no more than a step moves. So no loop earns
+        anything, whatever the distance jumps.
         """
-        if self.far is None or self.near is None:
+        if self.far is None or self.level is None:
             return 0.0
-        return max(-1.0, min(1.0, (self.far - self.near) / max(self.episode.length, 1.0)))
+        return (self.far - self.level) / max(self.episode.length, 1.0)
 
     # -- reporting ---------------------------------------------------------------------------------------------
 
@@ -276,8 +247,8 @@ class RoboThorEnv(Game):
             "success": self.won,
             "metrics": self._metrics(),
             "geodesic": {
-                "start": self.left_to_go.get(cell_at(self.episode.x, self.episode.z)),
-                "left": self._distance(),
+                "start": self.far,
+                "left": self.left_to_go,
                 "walked": self.walked,
                 "shortest": self.episode.length,
             },
@@ -299,10 +270,10 @@ class RoboThorEnv(Game):
     # -- exact state -------------------------------------------------------------------------------------------
 
     def _records(self) -> dict[str, Any]:
-        return {"walked": self.walked, "won": self.won, "near": self.near}
+        return {"walked": self.walked, "won": self.won, "level": self.level}
 
     def _recall(self, records: Mapping[str, Any]) -> None:
-        self.walked, self.won, self.near = records["walked"], records["won"], records["near"]
+        self.walked, self.won, self.level = records["walked"], records["won"], records["level"]
         self.event, self.left_to_go = self.world.observe(), self.world.distance(self.episode.target)
 
 

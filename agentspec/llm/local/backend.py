@@ -206,6 +206,8 @@ class LocalLLM:
 
     def record_states(self, layer: Any) -> StateRecorder:
         """From now on, what goes into a decoder `layer` of the model is recorded."""
+        from agentspec.llm.local.states import StateRecorder
+
         self._engine.model.recorder = recorder = StateRecorder(layer)
         return recorder
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.envs.alfred.env import start
 from agentspec.envs.alfred.goals import Changes, progress
+from agentspec.envs.alfred.staging import start
 from agentspec.envs.alfred.trials import PAPER, read_trial, trial_path
 from agentspec.envs.thor.mining import household
 from tests.envs.thor.household import LAYOUTS, OBJECTS, TRIALS, needs_data

@@ -11,7 +11,8 @@ from minigrid.core.world_object import Ball, Door, Goal, Key, Lava, Wall
 
 from agentspec.envs.minigrid.env import MiniGridEnv
 from agentspec.envs.minigrid.suites import SUITES
-from agentspec.envs.minigrid.view import Thing, basic, compact, look, relational
+from agentspec.envs.minigrid.texts import basic, compact, relational
+from agentspec.envs.minigrid.view import Thing, look
 
 
 def world(*, carrying=None, **cells):

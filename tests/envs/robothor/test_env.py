@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from agentspec.envs import check_environment
-from agentspec.envs.robothor.env import PRESETS, RoboThorEnv
+from agentspec.envs.robothor.env import RoboThorEnv
 from agentspec.envs.robothor.episodes import VALIDATION, read_episodes, scene_of
 from agentspec.envs.robothor.expert import Oracle
+from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor.geodesic import distances
 from agentspec.envs.thor.mining import apartment
 from agentspec.envs.thor.scene import cell_at

@@ -16,18 +16,21 @@ import numpy as np
 import pytest
 
 from agentspec.envs import check_environment
-from agentspec.envs.alfred.env import SETTINGS, AlfredEnv, set_up
+from agentspec.envs.alfred.env import AlfredEnv
 from agentspec.envs.alfred.expert import Expert
 from agentspec.envs.alfred.goals import Changes, progress
+from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import read_trial, trial_path
-from agentspec.envs.robothor.env import PRESETS, RoboThorEnv
+from agentspec.envs.robothor.env import RoboThorEnv
 from agentspec.envs.robothor.expert import Oracle
+from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor.engine import OfflineThor
 from agentspec.envs.thor.homes import apartment
-from agentspec.envs.thor.simulator import links
-from agentspec.envs.thor.simulator.links import AlfredLink, NoSimulator, RoboThorLink
+from agentspec.envs.thor.simulator import starting
+from agentspec.envs.thor.simulator.links import AlfredLink, RoboThorLink
 from agentspec.envs.thor.simulator.mirror import complete, mirror
 from agentspec.envs.thor.simulator.player import Ai2Thor
+from agentspec.envs.thor.simulator.starting import NoSimulator
 from agentspec.envs.thor.standin.launch import write_executable
 from agentspec.envs.thor.standin.play import Scenes, StandIn
 from agentspec.envs.thor.standin.wires import Posts
@@ -106,8 +109,8 @@ def same_play(make, player, options, seed: int, steps: int = 200) -> dict:
                 break
             text = player.act(info)
             seen, reward, terminated, truncated, info = env.step(text)
-            expected, *theirs, _ = twin.step(text)
-            assert [reward, terminated, truncated] == theirs
+            expected, paid, *theirs, _ = twin.step(text)
+            assert reward == pytest.approx(paid) and [terminated, truncated] == theirs
             ended = terminated or truncated
         return info
     finally:
@@ -241,10 +244,10 @@ def test_a_missing_package_names_its_extra(name, extra):
 
 
 def test_the_other_version_is_refused(monkeypatch):
-    monkeypatch.setattr(links, "version", lambda package: "2.7.2")
-    monkeypatch.setattr(links.importlib, "import_module", lambda name: sys)
+    monkeypatch.setattr(starting, "version", lambda package: "2.7.2")
+    monkeypatch.setattr(starting.importlib, "import_module", lambda name: sys)
     with pytest.raises(NoSimulator, match=r"2\.7\.2 is installed, this world needs 2\.1\.0.*ai2thor-alfred"):
-        links.controller_module("2.1.0", "ai2thor-alfred")
+        starting.controller_module("2.1.0", "ai2thor-alfred")
 
 
 class NoConnectionError(OSError):
@@ -269,7 +272,7 @@ def test_what_goes_wrong_is_told_in_one_line(error, told):
         raise error
 
     with pytest.raises(NoSimulator, match=told) as caught:
-        links._started(fails, "5.0.0")
+        starting.started(fails, "5.0.0")
     assert "\n" not in str(caught.value)
 
 

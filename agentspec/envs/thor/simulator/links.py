@@ -7,22 +7,21 @@ downloaded on first use and needs an X display. `executable` names any other pro
 
 from __future__ import annotations
 
-import importlib
 import os
-import threading
 import time
-from collections.abc import Callable, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from agentspec.envs.thor.engine import Settings
-
-START_SECONDS = 60.0
-"""Seconds within which a started player must answer."""
-
-
-class NoSimulator(RuntimeError):  # noqa: N818  (reads as a sentence)
-    """The simulator cannot be started, or has ended; the message is one line and says what to do."""
+from agentspec.envs.thor.simulator.starting import (
+    START_SECONDS,
+    NoSimulator,
+    alive,
+    check_executable,
+    controller_module,
+    started,
+    watch,
+)
 
 
 class Link(Protocol):
@@ -44,68 +43,6 @@ class Link(Protocol):
     def stop(self) -> None:
         """End the simulator."""
         ...
-
-
-def controller_module(wanted: str, extra: str) -> Any:
-    """`ai2thor.controller` of one version.
-
-    Raises:
-        NoSimulator: it is not installed, or in another version.
-    """
-    try:
-        found = version("ai2thor")
-        module = importlib.import_module("ai2thor.controller")
-    except (PackageNotFoundError, ImportError) as error:
-        raise NoSimulator(
-            f"the player ai2thor needs the package ai2thor {wanted}: pip install 'agentspec-rl[{extra}]' ({error})"
-        ) from error
-    if found != wanted:
-        raise NoSimulator(
-            f"ai2thor {found} is installed, this world needs {wanted}: the two exclude each other, make another "
-            f"environment and pip install 'agentspec-rl[{extra}]' there"
-        )
-    return module
-
-
-def _check_executable(path: str) -> None:
-    if path and not os.access(path, os.X_OK):
-        raise NoSimulator(f"there is no executable file {path}; expected a player that speaks ai2thor's protocol")
-
-
-def _started(make: Callable[[], Any], wanted: str) -> Any:
-    """What `make` returns, with ai2thor's several ways to fail told in one line.
-
-    Raises:
-        NoSimulator: no display, no build, no network, or a player that ends or never answers.
-    """
-    where = f"ai2thor {wanted}"
-    own = "or name a player with executable="
-    try:
-        return make()
-    except NoSimulator:
-        raise
-    except Exception as error:
-        told = " ".join(str(error).split())[:200]
-        if "display" in told.lower() or "missing dependencies" in told.lower():
-            message = f"{where} needs an X display with GLX and found none; set DISPLAY, {own} ({told})"
-        elif isinstance(error, OSError) and type(error).__module__.startswith("requests"):
-            message = f"no build of {where} is here and none can be downloaded: no network; install one, {own} ({told})"
-        elif "no build exists" in told.lower():
-            message = f"no build of {where} is here and none can be downloaded (no network?); install one, {own}"
-        else:
-            message = f"{where} did not start: {type(error).__name__}: {told}"
-        raise NoSimulator(message) from error
-
-
-def _watch(ended: Callable[[], bool], wake: Callable[[], None]) -> None:
-    """In the background: call `wake` once when the player has ended, for nobody else wakes who waits for it."""
-
-    def look() -> None:
-        while not ended():
-            time.sleep(0.2)
-        wake()
-
-    threading.Thread(target=look, daemon=True).start()
 
 
 class _Gone:
@@ -132,17 +69,17 @@ class AlfredLink:
 
     def __init__(self, settings: Settings, executable: str, pictures: bool, needs_display: bool = True) -> None:
         module = controller_module(self.version, self.extra)
-        _check_executable(executable)
+        check_executable(executable)
         self._settings, self._pictures, self._stopping = settings, pictures, False
         self._controller = c = module.Controller(quality="MediumCloseFitShadows")
         c.local_executable_path = executable or None
         if not needs_display:
             c.check_x_display = lambda display: None
         self._gone, self._begun = _Gone(), 0.0
-        _watch(self._ended, lambda: None if self._stopping else c.request_queue.put(self._gone))
+        watch(self._ended, lambda: None if self._stopping else c.request_queue.put(self._gone))
         size = {"player_screen_width": settings.width, "player_screen_height": settings.height}
         try:
-            first = _started(lambda: c.start(**size), self.version)
+            first = started(lambda: c.start(**size), self.version)
         except NoSimulator:
             self._stopping = True
             raise
@@ -156,7 +93,7 @@ class AlfredLink:
             return self._stopping
         self._begun = self._begun or time.monotonic()
         late = c.last_event is None and time.monotonic() - self._begun > START_SECONDS
-        return late or not _alive(c.unity_pid)
+        return late or not alive(c.unity_pid)
 
     def begin(self, scene: str) -> Any:
         """Reset and initialize, with the fields ALFRED sends."""
@@ -211,7 +148,7 @@ class RoboThorLink:
 
     def __init__(self, settings: Settings, executable: str, pictures: bool, needs_display: bool = True) -> None:
         self._module = controller_module(self.version, self.extra)
-        _check_executable(executable)
+        check_executable(executable)
         self._settings, self._executable, self._pictures = settings, executable, pictures
         self._controller: Any = None
         self._stopping = False
@@ -219,20 +156,20 @@ class RoboThorLink:
     def begin(self, scene: str) -> Any:
         """Start, or reset to the scene."""
         if self._controller is None:
-            self._controller = _started(lambda: self._start(scene), self.version)
+            self._controller = started(lambda: self._start(scene), self.version)
             return self._controller.last_event
-        return _started(lambda: self._controller.reset(scene), self.version)
+        return started(lambda: self._controller.reset(scene), self.version)
 
     def _start(self, scene: str) -> Any:
         s, link = self._settings, self
 
-        class Watched(self._module.Controller):  # type: ignore[misc,name-defined]
+        class Watched(self._module.Controller):  # type: ignore[name-defined]
             """A Controller whose player is watched from its start on."""
 
             def _start_unity_thread(self, *args: Any) -> None:
                 super()._start_unity_thread(*args)
                 server = self.server
-                _watch(lambda: server.unity_proc.poll() is not None, lambda: link._wake(server))
+                watch(lambda: server.unity_proc.poll() is not None, lambda: link._wake(server))
 
         return Watched(
             scene=scene,
@@ -289,14 +226,6 @@ class RoboThorLink:
         if not self._stopping and self._controller is not None:
             self._stopping = True
             self._controller.stop()
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError:
-        return False
-    return True
 
 
 LINKS: dict[str, type[AlfredLink] | type[RoboThorLink]] = {"2.1.0": AlfredLink, "5.0.0": RoboThorLink}
