@@ -42,7 +42,17 @@ def as_parquet(rows: Sequence[Row]) -> bytes:
 
     flat = _flat(rows)
     names: Iterable[str] = dict.fromkeys(name for row in flat for name in row)
-    table = pa.table({name: pa.array([row.get(name) for row in flat]) for name in names})
+    table = pa.table({name: _column([row.get(name) for row in flat]) for name in names})
     buffer = io.BytesIO()
     pq.write_table(table, buffer)
     return buffer.getvalue()
+
+
+def _column(values: list[Any]) -> Any:
+    """One type per column: text where kinds are mixed."""
+    import pyarrow as pa
+
+    try:
+        return pa.array(values)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):
+        return pa.array([None if value is None else str(value) for value in values])
