@@ -83,7 +83,9 @@ class Settings:
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
         given = GREEDY if self.sampling is None else self.sampling
-        plain = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+        plain: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in given.items()
+        }
         return replace(spec, sampling=replace(spec.sampling, **plain))
 
 
