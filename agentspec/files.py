@@ -15,12 +15,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+LONE = "backslashreplace"
+"""What becomes of half a surrogate pair, which endpoints answer and no file can hold: its JSON escape."""
+
 
 def write_atomic(path: str | Path, data: str | bytes) -> None:
     """Write a file so that it is either whole or absent, never half written (temporary file, then rename)."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    blob = data.encode() if isinstance(data, str) else data
+    blob = data.encode(errors=LONE) if isinstance(data, str) else data
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -55,7 +58,7 @@ def append_lines(path: str | Path, *records: Mapping[str, Any]) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     repair_lines(path)
-    with open(path, "a", encoding="utf-8") as file:
+    with open(path, "a", encoding="utf-8", errors=LONE) as file:
         file.write("".join(map(json_line, records)))
         file.flush()
         os.fsync(file.fileno())

@@ -19,7 +19,7 @@ from agentspec.files import file_digest
 from agentspec.llm import build_llm, capabilities_of, check_llm
 from agentspec.llm.base import LLM
 from agentspec.llm.helpers import check_helpers
-from agentspec.llm.models import base_of, resolve
+from agentspec.llm.models import SHIPPED, base_of, resolve
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.simulator import can_simulate
 from agentspec.spec import MODULE_KINDS, AgentSpec, ModuleSpec
@@ -139,8 +139,11 @@ def weighed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a backend with every folder of weights replaced by its digest."""
     found = dict(settings)
     for name in ("model", "adapter"):
-        if isinstance(found.get(name), str) and Path(found[name]).is_dir():
-            found[name] = f"weights:{weights_digest(Path(found[name]))}"
+        text = found.get(name)
+        if isinstance(text, str) and text:
+            shipped = (SHIPPED / text,) if name == "adapter" else ()
+            folder = next((path for path in (Path(text).expanduser(), *shipped) if path.is_dir()), None)
+            found[name] = f"weights:{weights_digest(folder)}" if folder else text
     return found
 
 
@@ -165,7 +168,7 @@ def check_agent(policy: Policy | None, spec: AgentSpec, env: Any, name: str) -> 
         if isinstance(spec.embedder, Mapping) and "endpoint" in spec.embedder:
             embedder_of(spec.embedder)  # which asks it once
     if not can_simulate(env):
-        spec.check(spec.needs() - {"snapshots"}, f"environment {name!r} without snapshot() and restore()")
+        spec.check(frozenset(spec.needs()) - {"snapshots"}, f"environment {name!r} without snapshot() and restore()")
 
 
 def calls_model(kind: str, name: str) -> bool:
@@ -180,11 +183,12 @@ def needs_model(spec: AgentSpec) -> bool:
 
 
 def weights_digest(folder: Path) -> str:
-    """16 hex digits over the names and bytes of a folder's safetensors files and configurations.
+    """16 hex digits over the names and bytes of a folder's files that decide what a model says.
 
-    Files are read whole, once per process while their size and time of change stay.
+    Weights, configurations, tokenizer and chat template; not what a trainer leaves beside them. Files are read whole,
+    once per process while their size and time of change stay.
     """
-    files = sorted([*folder.glob("*.safetensors"), *folder.glob("*config.json")])
+    files = sorted({path for pattern in WEIGHTS for path in folder.glob(pattern)})
     parts = [f"{path.name}:{_file_digest(path, *_stamp(path))}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
@@ -192,6 +196,10 @@ def weights_digest(folder: Path) -> str:
 def _stamp(path: Path) -> tuple[int, int]:
     status = path.stat()
     return status.st_size, status.st_mtime_ns
+
+
+WEIGHTS = ("*.safetensors", "*config.json", "tokenizer*", "special_tokens_map.json", "vocab.*", "merges.txt", "*.jinja")
+"""Names of those files."""
 
 
 @functools.cache

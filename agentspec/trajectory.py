@@ -135,7 +135,7 @@ def versions() -> dict[str, str]:
 @functools.cache
 def _versions() -> dict[str, str]:
     found = {"agentspec": __version__}
-    for name in ("gymnasium", "numpy", "torch", "transformers"):
+    for name in ("gymnasium", "minigrid", "numpy", "peft", "torch", "transformers"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -5,7 +5,8 @@
 
 `--data` is searched for `traj_data.json` of scenes whose object metadata and layout are there. A scene's table (cells,
 names of furniture) is mined from the trials below `--tables`, by default the same. `--without-own-plan` mines a table
-for each trial that does not know its plan (minutes). `--standin` plays through the Controller of ai2thor 2.1.0 and the stand-in.
+for each trial that does not know its plan (minutes). `--standin` plays through ai2thor 2.1.0's Controller and the
+stand-in.
 """
 
 from __future__ import annotations

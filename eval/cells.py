@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from agentspec.actions import suggest
@@ -11,6 +11,7 @@ from agentspec.carry import MemoryBank, start_bank
 from agentspec.episode import Job
 from agentspec.files import digest, file_digest, json_line
 from agentspec.llm.pricing import Prices
+from agentspec.parameters import check_types
 from agentspec.policies import Policy, weighed
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -61,10 +62,13 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise SpecError(f"{name} must be at least {least}, got {value}")
+        if self.timeout_s is not None and not self.timeout_s > 0:
+            raise SpecError(f"timeout_s must be above 0, got {self.timeout_s}")
         names = Sampling.__dataclass_fields__
         for name in self.sampling or ():
             if name not in names:
-                raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
+                raise SpecError(f"unknown key {name!r} in sampling{suggest(str(name), names)}")
+        check_types("sampling", Sampling, self.sampling or {})
 
     def start_of(self, policy: Policy, spec: AgentSpec) -> MemoryBank:
         """The memory that chains of episodes start from: nothing where nothing outlives an episode, or learns.
@@ -78,7 +82,11 @@ class Settings:
 
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
-        return replace(spec, sampling=replace(spec.sampling, **(GREEDY if self.sampling is None else self.sampling)))
+        given = GREEDY if self.sampling is None else self.sampling
+        plain: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in given.items()
+        }
+        return replace(spec, sampling=replace(spec.sampling, **plain))
 
 
 @dataclass(frozen=True)
@@ -137,7 +145,11 @@ class Cell:
             yield planned, record, memory
             if record is None:
                 return
-            memory = self.after(store, record, memory)
+            try:
+                memory = self.after(store, record, memory)
+            except ValueError:  # its state is gone: what comes after cannot be found, and playing will say why
+                yield from ((later, None, None) for later in chain[chain.index(planned) + 1 :][:1])
+                return
 
     def after(self, store: Store, record: Record, memory: bytes | None) -> bytes | None:
         """The memory after an episode: a failed one leaves the memory that it started from."""
@@ -154,9 +166,12 @@ def plan_cell(
     data = spec.to_data()
     if roles := data.get("roles"):
         data["roles"] = {pattern: weighed(role) for pattern, role in roles.items()}
-    configuration = store.describe(
-        {"spec": data, "policy": policy.identity(), "max_steps": settings.max_steps, "versions": versions()}
-    )
+    if isinstance(spec.embedder, Mapping):
+        data["embedder"] = weighed(spec.embedder)
+    described = {"spec": data, "policy": policy.identity(), "max_steps": settings.max_steps, "versions": versions()}
+    if spec.budget.cost is not None:  # prices say when such an episode is over
+        described["prices"] = {name: asdict(price) for name, price in settings.prices.table.items()}
+    configuration = store.describe(described)
     chains: list[tuple[Planned, ...]] = []
     for rollout in range(settings.rollouts):
         for label, members in sets.items():

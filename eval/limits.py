@@ -14,9 +14,9 @@ from agentspec.registry import SpecError
 class Limits:
     """Upper bounds; `None` is none. A cell is one policy (and training run) under one scaffold.
 
-    An episode that takes longer than `episode_s` fails. A cell that has spent its share starts no further episode;
-    those under way are played to their end, so it may spend a little more. What its finished episodes took is counted
-    from the store, over all starts of the evaluation.
+    An episode that takes longer than `episode_s` fails, and what its calls took is not known. A cell that has spent its
+    share starts no further episode; those under way are played to their end, so it may spend a little more. What its
+    finished episodes took, failed ones too, is counted from the store, over all starts of the evaluation.
 
     Args:
         episode_s: seconds of one episode, on the wall.
@@ -53,12 +53,19 @@ class Limits:
         """Which limit of a cell its episodes have reached, in words; empty if none."""
         totals = {"cell_s": 0.0, "cell_tokens": 0.0, "cell_dollars": 0.0}
         for record in records:
-            row = record["episode"]
             totals["cell_s"] += float(record.get("wall_s") or 0)
-            totals["cell_tokens"] += float(row.get("input_tokens") or 0) + float(row.get("output_tokens") or 0)
-            totals["cell_dollars"] += float(row.get("cost") or 0)
+            tokens, dollars = taken(record["episode"])
+            totals["cell_tokens"] += tokens
+            totals["cell_dollars"] += dollars
         for name, total in totals.items():
             most = getattr(self, name)
             if most is not None and total >= most:
                 return f"{name}: {total:.6g} of {most:.6g} spent"
         return ""
+
+
+def taken(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Tokens (in and out) and dollars of an episode; of one that failed, which has no figures, those of its calls."""
+    sums = list(row.get("modules", {}).values()) if row.get("status") == "failed" else [row]
+    tokens = sum((s.get("input_tokens") or 0) + (s.get("output_tokens") or 0) for s in sums)
+    return float(tokens), float(sum(s.get("cost") or 0 for s in sums))

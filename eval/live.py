@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from agentspec.progress import duration
 from eval.cells import Cell, CellName, Planned
+from eval.limits import taken
 from eval.matrix import Observer
 from eval.store import Record, Store
 
@@ -36,10 +37,11 @@ class Count:
         row = record["episode"]
         self.done += 1
         self.failed += row["status"] == "failed"
-        self.tokens += (row.get("input_tokens") or 0) + (row.get("output_tokens") or 0)
-        self.dollars += row.get("cost") or 0.0
-        for name, taken in row.get("modules", {}).items():
-            self.modules[name] = self.modules.get(name, 0.0) + taken["input_tokens"] + taken["output_tokens"]
+        tokens, dollars = taken(row)
+        self.tokens += tokens
+        self.dollars += dollars
+        for name, sums in row.get("modules", {}).items():
+            self.modules[name] = self.modules.get(name, 0.0) + sums["input_tokens"] + sums["output_tokens"]
 
 
 class LiveTable(Observer):

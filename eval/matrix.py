@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 from agentspec.actions import suggest
 from agentspec.episode import MakeEnv, make_env
-from agentspec.files import write_lines
+from agentspec.files import json_line, write_lines
 from agentspec.policies import Policy
 from agentspec.progress import load_policy
 from agentspec.registry import SpecError
@@ -94,6 +95,8 @@ def evaluate(
     settings = replace(settings or Settings(), **changes)
     sets = task_sets(tasks)
     _check(policies, specs, settings, executor)
+    if executor != "ray" and (workers != 1 or address):
+        raise SpecError("workers and address are those of Ray: give executor: ray (--executor ray), or leave them out")
     seen = observer or Observer()
     kept = Store(store or out)
     rows_of = [[plan_cell(p, label, spec, sets, settings, kept) for label, spec in specs.items()] for p in policies]
@@ -121,8 +124,25 @@ def evaluate(
         finally:
             seen.close()
             rows = [row for cell in cells for row in rows_of_cell(cell, kept, settings, problems.get(cell.name, ""))]
+            rows = [_from(Path(out), kept.folder, row) for row in rows]
             write_lines(Path(out) / RESULTS, rows)
     return rows
+
+
+def kept_episodes(
+    policies: Sequence[Policy], specs: Mapping[str, AgentSpec], tasks: Tasks, settings: Settings, store: str | Path
+) -> int:
+    """How many episodes of a matrix a store has already; failures count."""
+    sets, kept = task_sets(tasks), Store(store)
+    cells = [plan_cell(p, label, spec, sets, settings, kept) for p in policies for label, spec in specs.items()]
+    return sum(record is not None for cell in cells for chain in cell.chains for _, record, _ in cell.walk(kept, chain))
+
+
+def _from(out: Path, store: Path, row: dict[str, Any]) -> dict[str, Any]:
+    """The row with the path of its trajectory as it is found from `out`."""
+    if not row.get("trajectory") or out.resolve() == store.resolve():
+        return row
+    return row | {"trajectory": os.path.relpath(store / row["trajectory"], out)}
 
 
 def _play_policy(
@@ -227,6 +247,11 @@ def _check(policies: Sequence[Policy], specs: Mapping[str, AgentSpec], settings:
     twice = sorted({name for name, run in names if names.count((name, run)) > 1})
     if twice:
         raise SpecError(f"two policies are called {', '.join(twice)}; give each its own name (NAME=MODEL)")
+    for policy in dict.fromkeys(name for name, _ in names):
+        same = [p for p in policies if p.name == policy]
+        if len({json_line(p.identity()) for p in same}) < len(same):
+            runs = ", ".join(p.run for p in same)
+            raise SpecError(f"policy {policy!r}: two of its training runs ({runs}) have the same weights and settings")
     if settings.start_memory and not any(spec.scope == "run" for spec in specs.values()):
         raise SpecError("start_memory is given, but no scaffold has `scope: run`: every episode would start empty")
     if isinstance(settings.start_memory, Mapping):

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from agentspec.episode import Job, MakeEnv, Runner, make_env
@@ -111,12 +112,14 @@ class Play:
         store: open for writing.
         told: is told of every episode that was added.
         fresh: keys that may not be taken from the store although they are there: failures to be tried again.
+        under_way: keys that are being played, each locked: cells that ask for the same episode play it once.
     """
 
     store: Store
     settings: Settings
     told: Told
     fresh: set[str]
+    under_way: defaultdict[str, asyncio.Lock] = field(default_factory=lambda: defaultdict(asyncio.Lock))
 
     async def cell(self, cell: Cell, player: Player, gate: AbstractAsyncContextManager[Any]) -> None:
         """All chains of a cell, as many episodes at once as `gate` lets in; returns when none can go on."""
@@ -136,16 +139,21 @@ class Play:
         memory = cell.first_memory(chain)
         for planned in chain:
             key = cell.key(planned.job, memory)
-            record = None if key in self.fresh else self.store.get(key)
+            record = self._kept(key)
             if record is None:
-                async with gate:
-                    if self.settings.limits.spent(records):
-                        return
-                    played = await player.play(cell, replace(planned.job, memory_state=memory))
-                record = self._keep(cell, planned, key, played)
+                async with self.under_way[key]:
+                    if (record := self._kept(key)) is None:
+                        async with gate:
+                            if self.settings.limits.spent(records):
+                                return
+                            played = await player.play(cell, replace(planned.job, memory_state=memory))
+                        record = self._keep(cell, planned, key, played)
                 records.append(record)
                 self.told(cell, planned, record)
             memory = cell.after(self.store, record, memory)
+
+    def _kept(self, key: str) -> Record | None:
+        return None if key in self.fresh else self.store.get(key)
 
     def _keep(self, cell: Cell, planned: Planned, key: str, played: Played) -> Record:
         record: dict[str, Any] = {

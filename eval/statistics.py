@@ -134,6 +134,15 @@ def sign_flip(values: Values, *, seed: int = 0) -> float:
     return float((1 + np.sum(np.abs(sums) >= observed - slack)) / (1 + RESAMPLES))
 
 
+def least_p(n: int) -> float:
+    """The smallest p-value that `sign_flip` of `n` values can have: with 5 it is above 0.05 whatever they are.
+
+    >>> least_p(5), least_p(8)
+    (0.0625, 0.0078125)
+    """
+    return 2.0 ** (1 - n) if n <= EXACT_FLIPS else 1 / (1 + RESAMPLES)
+
+
 def bootstrap(values: Values, *, level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
     """Mean and percentile bootstrap interval (Efron, 1979), for values too skewed for a t interval.
 
@@ -182,6 +191,8 @@ def runs_mean(runs: Sequence[Mapping[K, float]], *, level: float = LEVEL) -> Est
     runs' mean, and the note says `this checkpoint only`.
     """
     common = _common(runs)
+    if len(runs) >= LEAST_RUNS and not common:
+        return Estimate(math.nan, math.nan, math.nan, 0, "run", note="no task that all runs have")
     if len(runs) < LEAST_RUNS:
         seeds = [math.fsum(run[key] for run in runs) / len(runs) for key in common] if runs else []
         return replace(mean_interval(seeds, level=level), note="this checkpoint only")
@@ -193,10 +204,13 @@ def compare_runs(
 ) -> Estimate:
     """Difference of two recipes' means over their training runs, on the task seeds that all runs have.
 
-    With `LEAST_RUNS` runs on both sides: Welch's t interval and test over runs. If `b` is one fixed policy that was not
-    trained (a start, an expert), pass it as one run: the unit is then the run of `a`, one sample. Otherwise the runs at
-    hand are compared over seeds, and the note says `this checkpoint only`.
+    With `LEAST_RUNS` runs on both sides: Welch's t interval and test over runs. If one side is a fixed policy that was
+    not trained (a start, an expert), pass it as one run: the unit is then the run of the other side, one sample.
+    Otherwise the runs at hand are compared over seeds, and the note says `this checkpoint only`.
     """
+    if len(a) == 1 and len(b) >= LEAST_RUNS:
+        turned = compare_runs(b, a, level=level, seed=seed)
+        return replace(turned, mean=-turned.mean, low=-turned.high, high=-turned.low)
     common = _common([*a, *b])
     if len(a) >= LEAST_RUNS and (len(b) == 1 or len(b) >= LEAST_RUNS):
         if not common:
@@ -296,8 +310,8 @@ def interactions(
     """How far each combination of two modules is from the sum of their effects: OLS with seed-clustered errors.
 
     The model is `value ~ C(first) * C(second)`; the first value met of each factor is the reference. Errors are
-    clustered
-    by task seed, with the small-sample correction and Student's t with clusters - 1 degrees of freedom.
+    clustered by task seed, with the small-sample correction and Student's t with clusters - 1 degrees of freedom. Where
+    the clusters do not differ beyond float noise there is nothing to test: `p` is 1 for no interaction, else 0.
 
     Args:
         rows: one per episode, or per seed and combination.
@@ -309,7 +323,7 @@ def interactions(
         (first, second) -> interaction effect, p-values corrected by Holm over the table.
 
     Raises:
-        ValueError: a combination without rows, or fewer than two choices or clusters.
+        ValueError: a combination without rows, fewer than two choices or clusters, or a value that is not finite.
     """
     import statsmodels.api as sm
 
@@ -334,15 +348,18 @@ def interactions(
         for j, (_, x, y) in enumerate(columns, start=1):
             design[i, j] = float((not x or a == x) and (not y or b == y))
     groups = np.array([clusters.index(row[cluster]) for row in rows])
-    values = np.array([float(row[value]) for row in rows])
+    values = _finite([float(row[value]) for row in rows], level)
+    scale = max(1.0, float(np.abs(values).max()))
     fitted = sm.OLS(values, design).fit(cov_type="cluster", cov_kwds={"groups": groups}, use_t=True)
     bounds = fitted.conf_int(alpha=1 - level)
     start = 1 + len(columns) - len(pairs)
     found = []
     for j in range(start, start + len(pairs)):
-        low, high = (float(bound) for bound in bounds[j])
-        p = float(fitted.pvalues[j])
-        found.append(Estimate(float(fitted.params[j]), low, high, len(clusters), unit=cluster, p=p))
+        mean, (low, high), p = float(fitted.params[j]), map(float, bounds[j]), float(fitted.pvalues[j])
+        if not fitted.bse[j] > 1e-7 * scale:  # clusters that agree to float noise (or below, where it is NaN)
+            mean = 0.0 if abs(mean) < 1e-9 * scale else mean
+            low, high, p = mean, mean, float(mean == 0)
+        found.append(Estimate(mean, low, high, len(clusters), unit=cluster, p=p))
     return dict(zip(pairs, corrected(found), strict=True))
 
 

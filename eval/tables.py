@@ -15,7 +15,7 @@ from typing import Any
 
 from agentspec.files import write_atomic
 from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
-from eval.statistics import Estimate, compare_runs, corrected, paired_runs, runs_mean
+from eval.statistics import Estimate, compare_runs, corrected, least_p, paired_runs, runs_mean
 
 Row = Mapping[str, Any]
 
@@ -123,6 +123,18 @@ def differences(
     return [{**names, **e.to_data(), "tie": e.tie(level)} for (names, _), e in zip(named, estimates, strict=True)]
 
 
+def differences_caption(compared: Sequence[Row], level: float = 0.95) -> str:
+    """What stands over or under a table of differences; also, where it has too few tasks to show any, that it has."""
+    least = min((len(compared) * least_p(row["n"]) for row in compared if row["n"]), default=1.0)
+    if any(row["unit"] == "run" for row in compared) or least <= 1 - level:
+        return DIFFERENCES
+    needed = 1 + math.ceil(math.log2(len(compared) / (1 - level)))
+    return (
+        f"{DIFFERENCES}. So few tasks cannot give {len(compared)} differences a p below {min(1.0, least):.3f}: every "
+        f"row is a tie whatever was measured; it takes {needed} tasks"
+    )
+
+
 def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
     """The report: per set of tasks the matrix of the primary metric, all metrics, and paired differences."""
     if not rows:
@@ -139,7 +151,8 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
         for by in ("policy", "scaffold"):
             compared = differences(members, primary, by=by, level=level)
             if compared:
-                parts += [f"Paired differences in {heading}, by {by} ({DIFFERENCES}):", ""]
+                caption = differences_caption(compared, level)
+                parts += [f"Paired differences in {heading}, by {by} ({caption}):", ""]
                 parts += [*_differences(compared, by, digits), ""]
     return "\n".join(parts)
 
@@ -147,7 +160,9 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
 def _unit(rows: Sequence[Row]) -> str:
     """Over what means and intervals are taken."""
     runs = max(len({r.get("run", "") for r in rows if r["policy"] == policy}) for policy in {r["policy"] for r in rows})
-    return "Mean over paired tasks" + (" (over training runs where a policy has three and more)" if runs > 1 else "")
+    return "Mean over the tasks that were completed" + (
+        " (over training runs where a policy has three and more)" if runs > 1 else ""
+    )
 
 
 def _world(rows: Sequence[Row]) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from agentspec.llm.models import ModelNotFoundError
+from agentspec.llm.models import SHIPPED, ModelNotFoundError
 from agentspec.policies import Policy, needs_model, weights_digest
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -72,3 +72,19 @@ def test_retrained_weights_are_another_policy(tmp_path: Path) -> None:
     weights.write_bytes(b"a" * 99 + b"b")
     assert policy.identity() != before
     assert policy.identity()["adapter"] == f"weights:{weights_digest(tmp_path)}"
+    (tmp_path / "optimizer.pt").write_bytes(b"a trainer's")
+    before = policy.identity()
+    assert before["adapter"] == f"weights:{weights_digest(tmp_path)}"
+    for name in ("chat_template.jinja", "tokenizer.json"):  # they decide what the model is shown
+        (tmp_path / name).write_text("other")
+        assert policy.identity() != before
+        before = policy.identity()
+
+
+def test_weights_count_by_content_however_they_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "adapter_model.safetensors").write_bytes(b"a" * 100)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert Policy("x", "m", "~/run").identity() == Policy("y", "m", str(tmp_path / "run")).identity()
+    named = Policy("x", "smollm2-135m", "smollm2-135m-courier").identity()["adapter"]
+    assert named == f"weights:{weights_digest(SHIPPED / 'smollm2-135m-courier')}"

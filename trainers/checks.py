@@ -120,9 +120,8 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
             given = getattr(spec, kind).params.items()
             temperatures |= {f"{kind}.{n}": v for n, v in given if n.endswith("temperature") and v is not None}
     for name, value in temperatures.items():
-        if not 0 < value < math.inf:
-            why = "greedy choices have no gradient" if value <= 0 else "that is no distribution of the policy"
-            yield f"agent.{name} is {value}, and its calls are trained: {why}; expected a finite number above 0"
+        if value <= 0:
+            yield f"agent.{name} is {value}, and its calls are trained: greedy choices have no gradient; set it above 0"
     if "images" in spec.needs():
         yield "agent.perception has images: true, and the policy under training reads text only; leave them out"
     if spec.sampling.top_p < 1 or spec.sampling.top_k > 0:

@@ -127,6 +127,7 @@ class LanguageAgentTreeSearch:
         purposes=Purpose.each("step", "propose", "think", "value", "reflect", "world"),
         needs=("n", "snapshots"),
         waived={"snapshots": ("world", "model")},
+        small=({"preset": "rl", "think": True},),
     )
 
     def __init__(

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from agentspec.episode import make_env
+from agentspec.llm.pricing import Price, Prices
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
@@ -18,6 +19,7 @@ from agentspec.spec import AgentSpec
 from agentspec.tasks import task_sets
 from agentspec.trajectory import read_trajectories
 from agentspec.types import Task
+from eval.cells import Settings, plan_cell
 from eval.limits import Limits
 from eval.matrix import evaluate
 from eval.store import Store
@@ -234,7 +236,7 @@ def test_what_cannot_work_is_refused_before_anything_is_played(tmp_path: Path) -
         (lambda: play(tmp_path, tasks=[TASKS[0], TASKS[0]]), "given twice"),
         (lambda: play(tmp_path, tasks=[Task("deliverybnch", 0)]), "did you mean deliverybench"),
         (lambda: play(tmp_path, sampling={"temprature": 1}), "did you mean temperature"),
-        (lambda: play(tmp_path, tasks=[Task(TOY, 0, {"nonsense": 1})]), "refused its options"),
+        (lambda: play(tmp_path, tasks=[Task(TOY, 0, {"nonsense": 1})]), "takes no option 'nonsense'"),
     ]
     for attempt, message in cases:
         with pytest.raises(SpecError, match=message):
@@ -260,3 +262,77 @@ def test_a_broken_results_file_is_named_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "episodes.jsonl").write_text('{"policy": "x"}\n')
     with pytest.raises(ValueError, match=r"episodes\.jsonl, line 1"):
         play(tmp_path)
+
+
+def test_cells_that_ask_for_the_same_episodes_play_them_once(tmp_path: Path) -> None:
+    told: list[str] = []
+    rows, _ = play(
+        tmp_path, policies=[SELLER], specs={"a": PLAIN, "b": PLAIN}, on_row=lambda row: told.append(row["scaffold"])
+    )
+    assert [r["scaffold"] for r in rows] == ["a"] * 3 + ["b"] * 3 and sorted(told) == ["a"] * 3 + ["b"] * 3
+    assert earned(rows, scaffold="a") == earned(rows, scaffold="b")
+    assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 3
+
+
+def test_failed_episodes_count_towards_the_limit_of_their_cell(tmp_path: Path) -> None:
+    broken = [Task(TOY, seed, {"fault": "crash"}) for seed in range(3)]
+    rows, _ = play(
+        tmp_path,
+        policies=[SELLER],
+        specs={"plain": PLAIN},
+        tasks=broken,
+        concurrency=1,
+        limits=Limits(cell_tokens=1),
+    )
+    assert [r["status"] for r in rows] == ["failed", "unplayed", "unplayed"]
+
+
+def test_prices_are_part_of_an_episode_that_they_can_end(tmp_path: Path) -> None:
+    prices = Prices({"scripted": Price(1e6, 1e6)})
+    bounded = AgentSpec.from_data({"budget": {"cost": 0.5}})
+    for spec, played, ended in ((PLAIN, [], "environment"), (bounded, ["seller"], "budget")):
+        out = tmp_path / ended
+        assert play(out, policies=[SELLER], specs={"s": spec})[0][0]["ended"] == "environment"
+        rows, made = play(out, policies=[SELLER], specs={"s": spec}, prices=prices)
+        assert made == played and rows[0]["ended"] == ended
+
+
+def test_a_sentence_encoder_counts_by_its_bytes(tmp_path: Path) -> None:
+    store, digests = Store(tmp_path / "store"), []
+    for weights in (b"a", b"b"):
+        encoder = tmp_path / "encoder"
+        encoder.mkdir(exist_ok=True)
+        (encoder / "model.safetensors").write_bytes(weights * 10)
+        (encoder / "config.json").write_text("{}")
+        spec = replace(PLAIN, embedder={"name": "minilm", "model": str(encoder)})
+        digests.append(plan_cell(SELLER, "s", spec, {"toy": TASKS}, Settings(), store).configuration)
+    assert digests[0] != digests[1]
+
+
+def test_a_record_may_hold_half_a_surrogate_pair(tmp_path: Path) -> None:
+    with Store(tmp_path).writing() as store:
+        store.add("k", {"episode": {"status": "failed", "error": "odd: \ud83d"}})
+    record = Store(tmp_path).get("k")
+    assert record is not None and record["episode"]["error"] == "odd: \ud83d"
+
+
+def test_rows_name_their_trajectories_as_found_from_their_own_folder(tmp_path: Path) -> None:
+    rows, _ = play(tmp_path / "out", policies=[SELLER], trajectories=True, store=tmp_path / "store")
+    assert all((tmp_path / "out" / row["trajectory"]).is_file() for row in rows)
+    assert json.loads((tmp_path / "store/episodes.jsonl").read_text().splitlines()[0])["trajectory"].startswith("traj")
+
+
+def test_a_lost_memory_stops_its_own_cell_and_says_so(tmp_path: Path) -> None:
+    specs = {"run": replace(SCAFFOLDS["memory"], scope="run"), "plain": PLAIN}
+    play(tmp_path, policies=[SELLER], specs=specs)
+    for state in (tmp_path / "states").iterdir():
+        state.unlink()
+    rows, _ = play(tmp_path, policies=[SELLER], specs=specs)
+    assert [r["status"] for r in rows] == ["completed", "unplayed", "unplayed"] + ["completed"] * 3
+    assert "is missing" in rows[1]["error"]
+
+
+def test_one_checkpoint_given_twice_is_not_two_training_runs(tmp_path: Path) -> None:
+    runs = [Policy("trained", model, run=str(i)) for i, model in enumerate(("m", "n", "m"))]
+    with pytest.raises(SpecError, match=r"'trained': two of its training runs \(0, 1, 2\) have the same weights"):
+        play(tmp_path, policies=runs)

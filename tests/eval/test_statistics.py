@@ -23,6 +23,7 @@ from eval.statistics import (
     holm,
     interactions,
     interquartile_mean,
+    least_p,
     mean_interval,
     minimum_detectable_effect,
     paired,
@@ -148,6 +149,42 @@ def test_a_run_with_a_value_that_is_no_number_is_refused() -> None:
     for b in ([{0: 1.0}], [{0: 1.0}] * 3):
         with pytest.raises(ValueError, match="finite"):
             compare_runs([{0: math.nan}] * 3, b)
+
+
+def test_it_does_not_matter_which_side_is_the_recipe() -> None:
+    recipe = [{k: float(k + gain) for k in range(8)} for gain in (1, 2, 6)]
+    fixed = [{k: float(k) for k in range(8)}]
+    ours, theirs = compare_runs(recipe, fixed), compare_runs(fixed, recipe)
+    assert (theirs.mean, theirs.low, theirs.high) == (-ours.mean, -ours.high, -ours.low)
+    assert (theirs.p, theirs.n, theirs.unit) == (ours.p, 3, "run") and ours.p > 0.05
+
+
+def test_the_mean_of_runs_without_a_common_task_is_no_number() -> None:
+    estimate = runs_mean([{"a": 1.0}, {"b": 2.0}, {"c": 3.0}])
+    assert math.isnan(estimate.mean) and (estimate.n, estimate.unit) == (0, "run") and estimate.note
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 8])
+def test_the_smallest_p_is_that_of_values_of_one_sign(n: int) -> None:
+    assert least_p(n) == sign_flip([1.0 + i for i in range(n)])
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1.0, 1e6])
+def test_equal_values_have_no_interaction(value: float) -> None:
+    def made(step: float) -> list[dict[str, object]]:
+        return [
+            {"seed": s, "a": a, "b": b, "y": value + step * (a + b)} for s in range(8) for a in (0, 1) for b in (0, 1)
+        ]
+
+    for step in (0.0, 0.3):  # all the same; a sum of effects, equal in every cluster up to float noise
+        [found] = interactions(made(step), "y", ("a", "b")).values()
+        assert (found.mean, found.p) == (0.0, 1.0) and found.tie()
+
+
+def test_interactions_refuse_what_is_no_number() -> None:
+    rows = [{"seed": s, "a": a, "b": b, "y": math.nan if s else 1.0} for s in range(3) for a in "xy" for b in "xy"]
+    with pytest.raises(ValueError, match="finite"):
+        interactions(rows, "y", ("a", "b"))
 
 
 def test_holm_steps_down():

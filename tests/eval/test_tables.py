@@ -13,7 +13,7 @@ from PIL import Image
 
 from eval.plots import matrix_heatmap, reward_curve, running_mean
 from eval.statistics import Estimate
-from eval.tables import differences, markdown, show, summarise, table, write_report
+from eval.tables import differences, differences_caption, markdown, show, summarise, table, write_report
 
 
 def row(policy: str, task: str, profit: float | None, *, scaffold: str = "plain", **changes: Any) -> dict[str, Any]:
@@ -137,3 +137,14 @@ def test_the_report_names_the_world_and_its_rules() -> None:
         "return": 1.0,
     }
     assert "World: deliverybench (size tiny); rules: fair." in markdown([row])
+
+
+def test_a_table_with_too_few_tasks_says_that_it_can_only_tie() -> None:
+    policies = "abcdefgh"
+    rows = [row(p, f"t{i}", 10.0 * k + i) for k, p in enumerate(policies) for i in range(8)]
+    compared = differences(rows, "hourly_profit")
+    assert all(r["tie"] for r in compared)  # 7 x 2^-7: above 0.05, though every task says the same
+    assert "it takes 9 tasks" in differences_caption(compared) and "it takes 9 tasks" in markdown(rows)
+    rows = [row(p, f"t{i}", 10.0 * k + i) for k, p in enumerate(policies) for i in range(9)]
+    compared = differences(rows, "hourly_profit")
+    assert not any(r["tie"] for r in compared) and "it takes" not in differences_caption(compared)

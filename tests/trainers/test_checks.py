@@ -112,8 +112,8 @@ def test_a_field_that_nobody_reads_is_refused(tmp_path: Path, name: str) -> None
         ({"adapter": "smollm2-135m-courier", "lora_targets": ["q_proj"]}, "lora_targets is ['q_proj'], which changes"),
         ({"agent": {"reasoning": {"name": "tot", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
         ({"agent": {"reasoning": {"name": "rap", "temperature": 0}}}, "agent.reasoning.temperature is 0"),
-        ({"agent": {"reasoning": {"name": "rap", "temperature": math.inf}}}, "agent.reasoning.temperature is inf"),
-        ({"agent": {"sampling": {"temperature": math.inf}}}, "agent.sampling.temperature is inf"),
+        ({"agent": {"reasoning": {"name": "rap", "temperature": math.inf}}}, "temperature is inf"),
+        ({"agent": {"sampling": {"temperature": math.inf}}}, "temperature=inf"),
         ({"rewards": {}}, "rewards is {}, which pays nothing"),
     ],
 )

@@ -84,6 +84,8 @@ class OfflineThor:
         self.sight = Sight(scene, self.settings.camera, self.settings.visibility, self.settings.slack)
         self._last = ("Initialize", True, "", None)
         self.touched()
+        s = self.settings
+        self._seen: dict[Any, Any] = scene.seen.setdefault((s.camera, s.visibility, s.slack, s.agent_height), {})
         return self.observe()
 
     # -- acting ------------------------------------------------------------------------------------------------
@@ -168,23 +170,22 @@ class OfflineThor:
     def _shortest_path(self, action: Mapping[str, Any]) -> dict[str, Any]:
         """Corners of the shortest way to a place from which an object is seen; `objectId` or `objectType`."""
         wanted = str(action.get("objectId") or action.get("objectType") or "")
-        start = action.get("position")
-        agent = self.state.agent
-        cell = cell_at(float(start["x"]), float(start["z"])) if start else cell_at(agent.x, agent.z)
+        place = action.get("position") or self._point((0, 0)) | {"x": self.state.agent.x, "z": self.state.agent.z}
+        x, z = float(place["x"]), float(place["z"])
         best, towards = self._way(wanted)
-        if cell not in best:
+        first = _entry(best, x, z)
+        if first is None:
             raise Refused(f"there is no way to a place from which {wanted!r} is seen")
-        return {"corners": [self._point(c) for c in corners(cell, towards)], "length": best[cell]}
+        way = [self._point(c) for c in corners(first, towards)]
+        if (way[0]["x"], way[0]["z"]) != (x, z):
+            way = [way[0] | {"x": x, "z": z}, *way]
+        return {"corners": way}
 
     def distance(self, target: str) -> float | None:
         """Metres on foot to where an object (id or type) is seen; None if there is no way."""
         best, (x, z) = self._way(target)[0], (self.state.agent.x, self.state.agent.z)
-        i, j = cell_at(x, z)
-        if (i * GRID, j * GRID) == (x, z):
-            return best.get((i, j))
-        # Between cells: by way of the nearest ones, so that nobody comes nearer by more than was walked.
-        near = [(i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (i + a, j + b) in best]
-        return min((best[c] + math.dist((x, z), (c[0] * GRID, c[1] * GRID)) for c in near), default=None)
+        first = _entry(best, x, z)
+        return None if first is None else best[first] + math.dist((x, z), (first[0] * GRID, first[1] * GRID))
 
     def _way(self, wanted: str) -> tuple[dict[Cell, float], dict[Cell, Cell]]:
         """`geodesic.distances` to where an object is seen; searched once until an object changes."""
@@ -222,7 +223,7 @@ class OfflineThor:
         self._objects = catalogue(self.state)
         self._places = np.array([b.position for b in self.state.bodies.values()]).reshape(-1, 3)
         self._index = {name: i for i, name in enumerate(self.state.bodies)}
-        self._seen: dict[tuple[float, ...], Any] = {}
+        self._seen = {}
         self._ways: dict[str, tuple[dict[Cell, float], dict[Cell, Cell]]] = {}
 
     def sees(self, body: Body) -> bool:
@@ -270,6 +271,18 @@ class OfflineThor:
         self._last = tuple(data["last"])
         self.touched()
         return self.observe()
+
+
+def _entry(best: Mapping[Cell, float], x: float, z: float) -> Cell | None:
+    """The cell by which the way from a point begins: the point's own, or between cells the best of those around it.
+
+    So nobody comes nearer by more than was walked.
+    """
+    i, j = cell_at(x, z)
+    if (i * GRID, j * GRID) == (x, z):
+        return (i, j) if (i, j) in best else None
+    near = [(i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (i + a, j + b) in best]
+    return min(near, key=lambda c: best[c] + math.dist((x, z), (c[0] * GRID, c[1] * GRID)), default=None)
 
 
 CHANGING: Mapping[str, Callable[[OfflineThor, Mapping[str, Any]], None]] = {**manipulation.ACTIONS, **setup.ACTIONS}

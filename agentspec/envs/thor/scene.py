@@ -7,8 +7,9 @@ are plain data: they come from code of ours (`homes`) or from recorded metadata 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,19 @@ class Scene:
         if name not in self._ways:
             self._ways[name] = distances(self.sights[name], self.cells)
         return self._ways[name]
+
+    def __deepcopy__(self, memo: Any) -> Scene:
+        """Nothing of it changes, so a copy is the same."""
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it is made of, without what is remembered."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @cached_property
+    def seen(self) -> dict[Any, dict[Any, Any]]:
+        """What players remember of it: how they look -> pose -> what is visible while nothing has been touched."""
+        return {}
 
     @cached_property
     def _ways(self) -> dict[str, tuple[dict[Cell, float], dict[Cell, Cell]]]:

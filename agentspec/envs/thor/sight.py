@@ -107,6 +107,8 @@ class Sight:
         self._high = np.array([b.high for b in bodies]).reshape(-1, 3)
         shut = {b.id for b in bodies if b.closed or b.held}  # what is in something that is carried goes with it
         self._hidden = np.array([any(p in shut for p in b.parents) for b in bodies], bool)
+        self._held = [i for i, b in enumerate(bodies) if b.held]
+        self._before: dict[str, list[int]] = {}
         volume = np.prod(self._high - self._low, axis=1)
         self._blocking = [
             i for i, b in enumerate(bodies) if volume[i] >= BLOCKING and b.type not in SEE_THROUGH and not b.held
@@ -121,8 +123,7 @@ class Sight:
         candidates = np.flatnonzero((flat <= self.reach) & ~self._hidden)
         if len(candidates):
             seen[candidates] = self._in_picture(candidates, nearest, eye, turn, agent)
-        for i, one in enumerate(self._bodies):
-            seen[i] |= one.held
+        seen[self._held] = True
         return seen
 
     def sees(self, one: Body, agent: Agent) -> bool:
@@ -166,15 +167,22 @@ class Sight:
         hidden = np.zeros(len(points), bool)
         for low, high in self._walls:
             hidden |= crosses(eye, points, low, high)
-        for i in self._blocking:
-            other = self._bodies[i]
-            around = self._low[i][[0, 2]] <= eye[[0, 2]], eye[[0, 2]] <= self._high[i][[0, 2]]
-            if other.id == one.id or other.id in one.parents or self._touch(other, one) or np.all(around):
+        for i in self._blockers(one):
+            low, high = self._low[i], self._high[i]
+            if low[0] <= eye[0] <= high[0] and low[2] <= eye[2] <= high[2]:
                 continue
-            hidden |= crosses(eye, points, self._low[i], self._high[i])
+            hidden |= crosses(eye, points, low, high)
             if hidden.all():
                 return False
         return not hidden.all()
+
+    def _blockers(self, one: Body) -> list[int]:
+        """Numbers of the large boxes that an object is no part of; found once until an object changes."""
+        if one.id not in self._before:
+            others = ((i, self._bodies[i]) for i in self._blocking)
+            apart = [i for i, b in others if b.id != one.id and b.id not in one.parents and not self._touch(b, one)]
+            self._before[one.id] = apart
+        return self._before[one.id]
 
     def free(self, one: Body, x: float, z: float) -> bool:
         """Whether an object can be seen from (x, z), looking anywhere: nothing is closed around it or before it."""

@@ -109,8 +109,8 @@ def same_play(make, player, options, seed: int, steps: int = 200) -> dict:
                 break
             text = player.act(info)
             seen, reward, terminated, truncated, info = env.step(text)
-            expected, *theirs, _ = twin.step(text)
-            assert [reward, terminated, truncated] == theirs
+            expected, paid, *theirs, _ = twin.step(text)
+            assert reward == pytest.approx(paid) and [terminated, truncated] == theirs
             ended = terminated or truncated
         return info
     finally:
