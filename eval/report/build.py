@@ -8,12 +8,9 @@ repeats a number is taken, and what its interval is.
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
-import json
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,9 +20,10 @@ from agentspec.metrics import PLAIN, Metric, columns, primary_metric
 from eval.naming import slug
 from eval.report import figures
 from eval.report.blocks import Block, Figure, Heading, Table, Text, to_html, to_latex, to_markdown
+from eval.report.data import as_csv, as_parquet
 from eval.report.sections import failures_section, learning_section, paper_section
 from eval.statistics import Estimate, interactions, least_p, minimum_detectable_effect, runs_mean
-from eval.tables import differences, differences_caption, show, show_p, summarise, values_by_run
+from eval.tables import difference_rows, differences, differences_caption, show, show_p, summarise, values_by_run
 
 Row = Mapping[str, Any]
 LEVEL = 0.95
@@ -93,12 +91,12 @@ def write_files(report: Report, folder: str | Path) -> list[Path]:
         "report.html": to_html(report.blocks, report.title),
         "report.md": to_markdown(report.blocks),
         "report.tex": to_latex(report.blocks),
-        "episodes.csv": _csv(report.rows),
+        "episodes.csv": as_csv(report.rows),
     }
     for figure in drawn:
         files |= {f"figures/{figure.name}.svg": figure.svg, f"figures/{figure.name}.png": figure.png}
     with contextlib.suppress(ImportError):  # the CSV says the same; pyarrow comes with the extra `train`
-        files["episodes.parquet"] = _parquet(report.rows)
+        files["episodes.parquet"] = as_parquet(report.rows)
     for name, data in files.items():
         write_atomic(folder / name, data)
     return [folder / name for name in files]
@@ -172,25 +170,12 @@ def _cells(tasks: str, rows: Sequence[Row]) -> list[Block]:
     for by in ("policy", "scaffold"):
         compared = differences(rows, metric.name, by=by, level=LEVEL)
         if compared:
-            blocks.append(_difference_table(compared, by, metric))
+            caption = f"Differences in {metric.heading}, by {by}: {differences_caption(compared, LEVEL)}."
+            blocks.append(Table(*difference_rows(compared, by, metric.digits), caption))
     blocks.append(_details(cells, columns(rows)))
     if text := _detectable(rows, metric):
         blocks.append(Text(text))
     return blocks
-
-
-def _difference_table(compared: Sequence[Mapping[str, Any]], by: str, metric: Metric) -> Table:
-    fixed = "scaffold" if by == "policy" else "policy"
-    body = []
-    for row in compared:
-        numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high", "p")]
-        estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
-        p = show_p(numbers[3])
-        counted = f"{row['n']} {row['unit']}s"
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, metric.digits), p, verdict, counted])
-    caption = f"Differences in {metric.heading}, by {by}: {differences_caption(compared, LEVEL)}."
-    return Table([fixed, "difference", "mean", "p", "verdict", "n"], body, caption)
 
 
 def _details(cells: Sequence[Any], metrics: Sequence[Metric]) -> Table:
@@ -416,40 +401,6 @@ def _costs(rows: Sequence[Row]) -> list[Block]:
             "Per step of the completed episodes; in all: failed ones too. Seconds are wall-clock, batches shared.",
         ),
     ]
-
-
-# -- data files ------------------------------------------------------------------------------------
-
-
-def _flat(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    flat = []
-    for row in rows:
-        plain = {k: v for k, v in row.items() if not isinstance(v, Mapping | list)}
-        plain |= {f"agent_{k}": v for k, v in row.get("agent", {}).items()}
-        flat.append(plain | {"options": json.dumps(row.get("options", {}), sort_keys=True)})
-    return flat
-
-
-def _csv(rows: Sequence[Row]) -> str:
-    flat = _flat(rows)
-    names = list(dict.fromkeys(name for row in flat for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue()
-
-
-def _parquet(rows: Sequence[Row]) -> bytes:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    flat = _flat(rows)
-    names: Iterable[str] = dict.fromkeys(name for row in flat for name in row)
-    table = pa.table({name: pa.array([row.get(name) for row in flat]) for name in names})
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    return buffer.getvalue()
 
 
 def _name(text: str) -> str:
