@@ -11,6 +11,7 @@ from agentspec.carry import MemoryBank, start_bank
 from agentspec.episode import Job
 from agentspec.files import digest, file_digest, json_line
 from agentspec.llm.pricing import Prices
+from agentspec.parameters import check_types
 from agentspec.policies import Policy, weighed
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -61,10 +62,13 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise SpecError(f"{name} must be at least {least}, got {value}")
+        if self.timeout_s is not None and not self.timeout_s > 0:
+            raise SpecError(f"timeout_s must be above 0, got {self.timeout_s}")
         names = Sampling.__dataclass_fields__
         for name in self.sampling or ():
             if name not in names:
-                raise SpecError(f"unknown key {name!r} in sampling{suggest(name, names)}")
+                raise SpecError(f"unknown key {name!r} in sampling{suggest(str(name), names)}")
+        check_types("sampling", Sampling, self.sampling or {})
 
     def start_of(self, policy: Policy, spec: AgentSpec) -> MemoryBank:
         """The memory that chains of episodes start from: nothing where nothing outlives an episode, or learns.
@@ -78,7 +82,11 @@ class Settings:
 
     def apply(self, spec: AgentSpec) -> AgentSpec:
         """The scaffold with the evaluation's sampling."""
-        return replace(spec, sampling=replace(spec.sampling, **(GREEDY if self.sampling is None else self.sampling)))
+        given = GREEDY if self.sampling is None else self.sampling
+        plain: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in given.items()
+        }
+        return replace(spec, sampling=replace(spec.sampling, **plain))
 
 
 @dataclass(frozen=True)

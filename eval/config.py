@@ -30,14 +30,16 @@ from typing import Any
 import yaml
 
 from agentspec.actions import suggest
-from agentspec.llm.pricing import Price, Prices
+from agentspec.llm.pricing import Prices
+from agentspec.parameters import check_types
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
-from agentspec.tasks import parse_seeds
+from agentspec.tasks import SPLITS, parse_seeds
 from agentspec.types import Task
 from eval.cells import Settings
 from eval.limits import Limits
+from eval.matrix import evaluate
 
 TOP = ("policies", "scaffolds", "tasks", "out", "store", "executor", "workers", "address", "prices", "limits")
 OF_SETTINGS = tuple(f.name for f in fields(Settings) if f.name not in ("prices", "limits"))
@@ -73,14 +75,31 @@ def read_matrix(path: str | Path) -> Matrix:
     path = Path(path)
     if not path.is_file():
         raise SpecError(f"there is no matrix {path}; give a YAML file with policies, scaffolds and tasks")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    try:  # a safe loader
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_Unique)
     except yaml.YAMLError as error:
         raise SpecError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}") from error
     try:
         return _matrix(_mapping(data, "a matrix"), path.parent)
     except SpecError as error:
         raise SpecError(f"{path}: {error}") from error
+
+
+class _Unique(yaml.SafeLoader):
+    """Safe YAML in which no label stands twice: the first would be dropped without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As its base class.
+
+        Raises:
+            SpecError: a key that the mapping has already.
+        """
+        keys = [key.value for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        if twice := sorted({str(key) for key in keys if keys.count(key) > 1}):
+            raise SpecError(f"{', '.join(twice)} stands twice, in the mapping at line {node.start_mark.line + 1}")
+        return super().construct_mapping(node, deep=deep)
 
 
 def _matrix(data: Mapping[str, Any], beside: Path) -> Matrix:
@@ -100,14 +119,16 @@ def _matrix(data: Mapping[str, Any], beside: Path) -> Matrix:
     given["prices"] = _prices(data.get("prices"), beside)
     if isinstance(start := given.get("start_memory"), str):
         given["start_memory"] = _beside(start, beside)
-    elif start:
-        given["start_memory"] = {k: _beside(v, beside) for k, v in _mapping(start, "start_memory").items()}
-    try:
-        settings = Settings(**given)
-    except TypeError as error:
-        raise SpecError(f"a setting has a value of the wrong kind: {error}") from error
-    arguments = {name: data[name] for name in ("out", "store", "executor", "workers", "address") if name in data}
-    return Matrix(tuple(policies), scaffolds, tasks, settings, arguments)
+    elif isinstance(start, Mapping):
+        given["start_memory"] = {k: _beside(str(v), beside) for k, v in start.items()}
+    check_types("a matrix", Settings, given)
+    names = ("out", "store", "executor", "workers", "address")
+    arguments = {name: data[name] for name in names if data.get(name) is not None}
+    check_types("a matrix", evaluate, arguments)
+    for name in ("out", "store"):
+        if not isinstance(arguments.get(name, ""), str):
+            raise SpecError(f"a matrix: {name} must be a folder, got {arguments[name]!r}")
+    return Matrix(tuple(policies), scaffolds, tasks, Settings(**given), arguments)
 
 
 def policy_runs(name: str, item: Any, beside: Path) -> list[Policy]:
@@ -159,7 +180,10 @@ def _tasks(label: str, item: Any) -> list[Task]:
     seeds = data.get("seeds", "20000-20007")
     texts = [str(seed) for seed in seeds] if isinstance(seeds, list) else [str(seeds)]
     options = dict(_mapping(data.get("options") or {}, f"options of tasks {label!r}"))
-    return [Task(data["env"], seed, options, str(data.get("split", "test"))) for seed in parse_seeds(texts)]
+    split = data.get("split", "test")
+    if split not in SPLITS:
+        raise SpecError(f"tasks {label!r}: unknown split {split!r}; expected one of {', '.join(SPLITS)}")
+    return [Task(data["env"], seed, options, split) for seed in parse_seeds(texts)]
 
 
 def _prices(item: Any, beside: Path) -> Prices:
@@ -167,10 +191,7 @@ def _prices(item: Any, beside: Path) -> Prices:
         return Prices()
     if isinstance(item, str):
         return Prices.from_yaml(_beside(item, beside))
-    try:
-        return Prices({str(name): Price(**value) for name, value in _mapping(item, "prices").items()})
-    except TypeError as error:
-        raise SpecError(f"prices: {error}; expected {{model: {{input, output, cached}}}} in $ per million") from error
+    return Prices.from_data(item, "prices")
 
 
 def _beside(text: str, folder: Path) -> str:

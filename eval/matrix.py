@@ -95,6 +95,8 @@ def evaluate(
     settings = replace(settings or Settings(), **changes)
     sets = task_sets(tasks)
     _check(policies, specs, settings, executor)
+    if executor != "ray" and (workers != 1 or address):
+        raise SpecError("workers and address are those of Ray: give executor: ray (--executor ray), or leave them out")
     seen = observer or Observer()
     kept = Store(store or out)
     rows_of = [[plan_cell(p, label, spec, sets, settings, kept) for label, spec in specs.items()] for p in policies]
@@ -125,6 +127,15 @@ def evaluate(
             rows = [_from(Path(out), kept.folder, row) for row in rows]
             write_lines(Path(out) / RESULTS, rows)
     return rows
+
+
+def kept_episodes(
+    policies: Sequence[Policy], specs: Mapping[str, AgentSpec], tasks: Tasks, settings: Settings, store: str | Path
+) -> int:
+    """How many episodes of a matrix a store has already; failures count."""
+    sets, kept = task_sets(tasks), Store(store)
+    cells = [plan_cell(p, label, spec, sets, settings, kept) for p in policies for label, spec in specs.items()]
+    return sum(record is not None for cell in cells for chain in cell.chains for _, record, _ in cell.walk(kept, chain))
 
 
 def _from(out: Path, store: Path, row: dict[str, Any]) -> dict[str, Any]:

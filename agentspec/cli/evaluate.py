@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
     from eval.config import Matrix
 
 HELD_OUT = "20000-20007"
+BESIDE_CONFIG = (
+    *("config", "executor", "workers", "address", "dry_run"),
+    *("out", "store", "trajectories", "retry_failed", "plot", "json"),
+)
+"""Arguments that may stand beside `--config`; what all others say stands in the file."""
 
 
 def add_parser(commands: Any) -> None:
@@ -38,9 +44,7 @@ def add_parser(commands: Any) -> None:
         help="measure policies under scaffolds",
         description="Play every policy under every scaffold on the same tasks: intervals, paired tests.",
     )
-    parser.add_argument(
-        "--config", metavar="FILE", help="the whole matrix as YAML (then no --policies, --specs, --seeds)"
-    )
+    parser.add_argument("--config", metavar="FILE", help="the whole matrix as YAML: what is played, and how")
     parser.add_argument(
         "--policies",
         nargs="+",
@@ -95,7 +99,8 @@ def add_parser(commands: Any) -> None:
     group.add_argument("--retry-failed", action="store_true", help="play episodes again that failed")
     group.add_argument("--plot", action="store_true", help="write matrix.png")
     group.add_argument("--json", action="store_true", help="print the summary as JSON instead of tables")
-    parser.set_defaults(command=run, out_resumes=True)
+    said = {name: value for name, value in vars(parser.parse_args([])).items() if name not in BESIDE_CONFIG}
+    parser.set_defaults(command=run, out_resumes=True, said_by_config=said)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -104,8 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     Exit code 1 if an episode could not be played or no episode could be scored.
     """
     from eval.live import LiveTable
-    from eval.matrix import UNPLAYED, evaluate
-    from eval.store import Store
+    from eval.matrix import UNPLAYED, evaluate, kept_episodes
     from eval.tables import markdown, summarise, write_report
 
     require("scipy", *(["matplotlib"] if arguments.plot else []))  # for the report at the end
@@ -115,12 +119,15 @@ def run(arguments: argparse.Namespace) -> int:
     if not call.get("out"):
         raise SpecError("--out is missing: the folder of results (in a matrix file: `out`)")
     if arguments.dry_run:
-        print(_summary(matrix, len(Store(call.get("store") or call["out"]))))
+        store = call.get("store") or call["out"]
+        print(_summary(matrix, kept_episodes(matrix.policies, matrix.scaffolds, matrix.tasks, matrix.settings, store)))
         return 0
     rows = evaluate(
         matrix.policies, matrix.scaffolds, matrix.tasks, settings=matrix.settings, observer=LiveTable(), **call
     )
     write_report(rows, call["out"])
+    if matrix.settings.trajectories and (bare := sum("key" in row and "trajectory" not in row for row in rows)):
+        print(f"{bare} episodes were played before trajectories were kept, and have none", file=sys.stderr)
     if arguments.plot:
         from eval.plots import matrix_heatmap
 
@@ -142,9 +149,10 @@ def _matrix(arguments: argparse.Namespace) -> Matrix:
     from eval.config import Matrix, read_matrix
 
     if arguments.config:
-        given = [f"--{name}" for name in ("policies", "specs") if getattr(arguments, name)]
+        said = arguments.said_by_config
+        given = [f"--{n.replace('_', '-')}" for n, default in said.items() if getattr(arguments, n) != default]
         if given:
-            raise SpecError(f"{' and '.join(given)} beside --config: the file names policies, scaffolds and tasks")
+            raise SpecError(f"{' and '.join(given)} beside --config: what is played, and how, stands in the file")
         matrix = read_matrix(arguments.config)
         changed: dict[str, Any] = {name: True for name in ("trajectories", "retry_failed") if getattr(arguments, name)}
         return replace(matrix, settings=replace(matrix.settings, **changed))
@@ -178,7 +186,7 @@ def _summary(matrix: Matrix, kept: int) -> str:
     policies = ", ".join(f"{p.name} {p.run}".strip() for p in matrix.policies)
     return (
         f"policies: {policies}\nscaffolds: {', '.join(matrix.scaffolds)}\ntasks: {tasks}\n"
-        f"{matrix.episodes} episodes; the store holds {kept} (those of this matrix are not played again)"
+        f"{matrix.episodes} episodes, {kept} of them in the store"
     )
 
 

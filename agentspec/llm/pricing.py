@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -33,15 +34,23 @@ class Prices:
         Raises:
             ValueError: the file is not such a mapping.
         """
-        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return cls.from_data(yaml.safe_load(Path(path).read_text(encoding="utf-8")), str(path))
+
+    @classmethod
+    def from_data(cls, data: Any, where: str) -> Prices:
+        """From parsed YAML; `where` it stands begins the messages.
+
+        Raises:
+            ValueError: not such a mapping.
+        """
         if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
-            raise ValueError(f"{path}: expected a mapping of model name to {{input, output, cached}} in $ per million")
+            raise ValueError(f"{where}: expected a mapping of model name to {{input, output, cached}} in $ per million")
         for name, value in data.items():
             unknown = [key for key in value if key not in Price.__dataclass_fields__]
             given = [v for key, v in value.items() if (key, v) != ("cached", None)]
             if unknown or not all(isinstance(v, int | float) and v >= 0 for v in given):
                 raise ValueError(
-                    f"{path}: {name} is {value}; expected input, output and cached in $ per million tokens"
+                    f"{where}: {name} is {value}; expected input, output and cached in $ per million tokens"
                 )
         return cls({str(name): Price(**value) for name, value in data.items()})
 

@@ -12,6 +12,7 @@ import csv
 import io
 import json
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,11 +20,12 @@ from typing import Any
 
 from agentspec.files import file_digest, read_lines, write_atomic
 from agentspec.metrics import PLAIN, Metric, columns, primary_metric
+from eval.naming import slug
 from eval.report import figures
 from eval.report.blocks import Block, Figure, Heading, Table, Text, to_html, to_latex, to_markdown
 from eval.report.sections import failures_section, learning_section, paper_section
-from eval.statistics import Estimate, interactions, minimum_detectable_effect, runs_mean
-from eval.tables import DIFFERENCES, differences, show, show_p, summarise, values_by_run
+from eval.statistics import Estimate, interactions, least_p, minimum_detectable_effect, runs_mean
+from eval.tables import differences, differences_caption, show, show_p, summarise, values_by_run
 
 Row = Mapping[str, Any]
 LEVEL = 0.95
@@ -112,7 +114,8 @@ def _overview(rows: Sequence[Row], path: Path) -> list[Block]:
     for policy in dict.fromkeys(row["policy"] for row in rows):
         mine = [row for row in rows if row["policy"] == policy]
         runs = {row.get("run", "") for row in mine}
-        body.append([policy, str(len(runs)), str(len({r["task"] for r in mine})), str(len(mine))])
+        played = sum(row["status"] != "unplayed" for row in mine)
+        body.append([policy, str(len(runs)), str(len({r["task"] for r in mine})), f"{played} of {len(mine)}"])
     agents = []
     for scaffold in dict.fromkeys(row["scaffold"] for row in rows):
         agent: Mapping[str, str] = next((r["agent"] for r in rows if r["scaffold"] == scaffold and _acts(r)), {})
@@ -122,7 +125,7 @@ def _overview(rows: Sequence[Row], path: Path) -> list[Block]:
     source = f"Made from `{path.name}` (SHA-256 `{file_digest(path)[:16]}`): {len(rows)} episodes, {counts}."
     return [
         Text(source),
-        Table(["policy", "training runs", "tasks", "episodes"], body, "What was played by whom."),
+        Table(["policy", "training runs", "tasks", "episodes played"], body, "What was played by whom."),
         Table(
             ["scaffold", "reasoning", "memory", "reflection", "layout", "scope"],
             agents,
@@ -186,7 +189,7 @@ def _difference_table(compared: Sequence[Mapping[str, Any]], by: str, metric: Me
         p = show_p(numbers[3])
         counted = f"{row['n']} {row['unit']}s"
         body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, metric.digits), p, verdict, counted])
-    caption = f"Differences in {metric.heading}, by {by}: {DIFFERENCES}."
+    caption = f"Differences in {metric.heading}, by {by}: {differences_caption(compared, LEVEL)}."
     return Table([fixed, "difference", "mean", "p", "verdict", "n"], body, caption)
 
 
@@ -221,8 +224,12 @@ def _detectable(rows: Sequence[Row], metric: Metric) -> str:
                 count = max(count, len(gaps))
     if not found:
         return ""
-    deviation = sorted(found)[len(found) // 2]
-    effect = minimum_detectable_effect(deviation, count) if deviation else 0.0
+    if least_p(count) > 1 - LEVEL:
+        return f"{count} paired tasks are too few for any difference to be found by the sign-flip test, however large."
+    deviation = statistics.median(found)
+    if not deviation:
+        return ""
+    effect = minimum_detectable_effect(deviation, count)
     return (
         f"With {count} paired tasks and the median deviation of a difference ({deviation:.{metric.digits}f}), a "
         f"difference of {effect:.{metric.digits}f} in {metric.heading} would be found in four of five evaluations "
@@ -288,7 +295,8 @@ def _interactions(rows: Sequence[Row], metric: Metric) -> list[Block]:
     ]
     caption = (
         f"Interactions in {metric.heading}: how far a combination is from the sum of its parts; OLS, errors clustered "
-        "by task (by training run where there are runs), p corrected by Holm over the table."
+        f"by task (by training run where there are runs; {next(iter(found.values())).n} clusters), p corrected by Holm "
+        "over the table. Whatever else scaffolds differ in (layout, parameters) is averaged."
     )
     return [Table(["combination", "effect", "p", "verdict"], body, caption)]
 
@@ -371,10 +379,11 @@ def _costs(rows: Sequence[Row]) -> list[Block]:
         for row in rows:
             if (row["policy"], row["scaffold"]) == (policy, scaffold):
                 steps += row.get("steps") or 0
+                stepped = row["status"] == "completed"  # a failed episode has no count of its steps
                 for module, taken in row.get("modules", {}).items():
                     total = sums.setdefault(module, [0.0] * 5)
                     for i, key in enumerate(("calls", "input_tokens", "output_tokens", "cost", "latency_s")):
-                        total[i] += taken[key]
+                        total[i] += taken[key] if stepped or i >= 3 else 0.0
         for module, (calls, tokens_in, tokens_out, dollars, seconds) in sums.items():
             per = max(1, steps)
             body.append(
@@ -401,7 +410,11 @@ def _costs(rows: Sequence[Row]) -> list[Block]:
     ]
     return [
         Heading("Costs by module"),
-        Table(header, body, "All episodes together; seconds are wall-clock, batches shared."),
+        Table(
+            header,
+            body,
+            "Per step of the completed episodes; in all: failed ones too. Seconds are wall-clock, batches shared.",
+        ),
     ]
 
 
@@ -440,4 +453,4 @@ def _parquet(rows: Sequence[Row]) -> bytes:
 
 
 def _name(text: str) -> str:
-    return "".join(c if c.isalnum() else "-" for c in text.lower()).strip("-")
+    return slug(text).replace("_", "-")

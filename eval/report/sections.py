@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,23 +55,28 @@ def failures_section(rows: Sequence[Row], folder: Path, *, paper: bool) -> list[
     if not kept:
         return []
     shares = by_scaffold(_diagnosed(kept, folder))
-    present = [leaf for leaf in (*LEAVES, OPEN) if any(s.leaves[leaf] for s in shares.values())]
+    worlds = dict.fromkeys(world for world, _ in shares)
+    printed = {world: found for world in worlds if (found := paper_shares(world))} if paper else {}
+    present = [
+        leaf
+        for leaf in (*LEAVES, OPEN)
+        if any(s.leaves[leaf] for s in shares.values()) or any(found.get(leaf) for found in printed.values())
+    ]
     blocks: list[Block] = [Heading("Failures")]
-    if not present:
+    if not any(s.failed for s in shares.values()):
         return [*blocks, Text(f"None of {len(kept)} episodes failed.")]
     named = [(f"{world} / {scaffold}", s) for (world, scaffold), s in shares.items() if s.failed]
     groups = {name: _parts(s, present) for name, s in named}
-    if paper:
-        for world in dict.fromkeys(world for world, _ in shares):
-            if printed := paper_shares(world):
-                groups[f"{world}: the paper's agents"] = [printed.get(leaf, 0.0) for leaf in present]
+    for world, found in printed.items():
+        groups[f"{world}: the paper's agents"] = [found.get(leaf, 0.0) for leaf in present]
     parts = {leaf: [values[i] for values in groups.values()] for i, leaf in enumerate(present)}
     body = [
         [name, str(s.episodes), str(s.failed), *(f"{s.share(leaf):.0%}" if s.leaves[leaf] else "–" for leaf in present)]
         for name, s in named
     ]
     caption = (
-        "Share of failures that each kind leads, by rules on the trajectory; `open`: no rule explains it. "
+        "Share of failures that each kind leads, by rules on the trajectory, all policies together; `open`: no rule "
+        "explains it. "
         f"n = {sum(s.failed for s in shares.values())} failures of {sum(s.episodes for s in shares.values())} episodes."
     )
     drawing = figures.shares("failures", list(groups), parts, heading="share of failures", caption=caption)
@@ -116,10 +122,10 @@ def paper_section(rows: Sequence[Row]) -> list[Block]:
 def _beside(world: str, rows: Sequence[Row]) -> list[list[str]]:
     wanted = "hourly_profit" if world == "deliverybench" else "success_rate"
     metric = primary_metric(rows)
-    agents = {row["scaffold"]: row["agent"] for row in rows if row.get("agent")}
+    agents = {(row["policy"], row["scaffold"]): row["agent"] for row in rows if row.get("agent")}
     body = []
     for cell in summarise(rows):
-        agent = agents.get(cell.scaffold, {})
+        agent = agents.get((cell.policy, cell.scaffold), {})  # a scripted policy's is none of the paper's
         modules = tuple(agent.get(kind, "") for kind in ("reasoning", "memory", "reflection"))
         printed = sorted(
             n.value
@@ -127,7 +133,7 @@ def _beside(world: str, rows: Sequence[Row]) -> list[list[str]]:
             if n.environment == world and n.metric == wanted and n.scaffold == modules and n.policy == "non_rl"
         )
         if printed and metric.name in cell.estimates:
-            low, median, high = printed[0], printed[len(printed) // 2], printed[-1]
+            low, median, high = printed[0], statistics.median(printed), printed[-1]
             ours = show(cell.estimates[metric.name], metric.digits)
             numbers = [f"{value:.2f}" for value in (low, median, high)]
             body.append([cell.policy, " + ".join(m for m in modules if m != "none"), ours, *numbers])

@@ -6,10 +6,12 @@ import csv
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from agentspec.cli import main
+from agentspec.files import write_lines
 from agentspec.llm.base import Request
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.policies import Policy
@@ -17,7 +19,7 @@ from agentspec.spec import AgentSpec
 from agentspec.types import Task
 from eval.matrix import evaluate
 from eval.report import build_report, write_files
-from eval.report.blocks import Figure, Table, to_html, to_latex
+from eval.report.blocks import Figure, Table, Text, to_html, to_latex
 from eval.report.figures import pareto_front
 from tests.toy_env import TOY
 
@@ -110,3 +112,51 @@ def test_from_the_command_line(folder: Path, tmp_path: Path, capsys: pytest.Capt
         main(["report", str(tmp_path / "nowhere"), "--to", str(tmp_path / "x")])
     assert end.value.code == 2
     assert "give the folder of an evaluation" in capsys.readouterr().err
+
+
+def hand_made(folder: Path, rows: list[dict[str, Any]]) -> Any:
+    agent = {"reasoning": "react", "memory": "base", "reflection": "none", "layout": "conversation", "scope": "episode"}
+    plain = {"tasks": "t", "run": "", "scaffold": "s", "rollout": 0, "status": "completed", "env": "minigrid"}
+    write_lines(folder / "results.jsonl", [plain | {"agent": agent, "steps": 10} | row for row in rows])
+    return build_report(folder, paper=True)
+
+
+def tables(report: Any) -> list[Table]:
+    return [block for block in report.blocks if isinstance(block, Table)]
+
+
+def test_costs_per_step_are_those_of_episodes_with_steps(tmp_path: Path) -> None:
+    call = {"calls": 10, "input_tokens": 1000, "output_tokens": 20, "cost": 0.5, "latency_s": 3.0}
+    failed = {"status": "failed", "steps": None, "success": None}
+    report = hand_made(
+        tmp_path,
+        [
+            {"policy": "p", "task": "a", "success": 1.0, "modules": {"reasoning": call}},
+            {"policy": "p", "task": "b", "modules": {"reasoning": call}, **failed},
+        ],
+    )
+    [costs] = [t for t in tables(report) if "calls/step" in t.header]
+    assert list(costs.body[0]) == ["p / s", "reasoning", "1.00", "100", "2.0", "1.0000", "6"]
+
+
+def test_the_paper_stands_beside_models_whoever_comes_last(tmp_path: Path) -> None:
+    scripted = dict.fromkeys(("memory", "reflection"), "none") | {"reasoning": "random", "layout": "", "scope": ""}
+    rows = [
+        {"policy": "model", "task": "a", "success": 1.0},
+        {"policy": "random", "task": "a", "success": 0.0, "agent": scripted},
+    ]
+    [beside] = [t for t in tables(hand_made(tmp_path, rows)) if "median" in t.header]
+    assert [row[0] for row in beside.body] == ["model"]
+
+
+def test_too_few_tasks_promise_no_difference_and_labels_keep_their_pictures(tmp_path: Path) -> None:
+    rows = [
+        {"policy": policy, "task": f"{label}{i}", "tasks": label, "success": float(i == j)}
+        for label in ("A", "a")
+        for j, policy in enumerate("pq")
+        for i in range(5)
+    ]
+    report = hand_made(tmp_path, rows)
+    assert any("5 paired tasks are too few" in block.text for block in report.blocks if isinstance(block, Text))
+    names = [block.name for block in report.blocks if isinstance(block, Figure)]
+    assert len(set(names)) == len(names)

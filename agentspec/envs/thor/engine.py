@@ -85,7 +85,7 @@ class OfflineThor:
         self._last = ("Initialize", True, "", None)
         self.touched()
         s = self.settings
-        self._seen = scene.seen.setdefault((s.camera, s.visibility, s.slack, s.agent_height), {})
+        self._seen: dict[Any, Any] = scene.seen.setdefault((s.camera, s.visibility, s.slack, s.agent_height), {})
         return self.observe()
 
     # -- acting ------------------------------------------------------------------------------------------------
@@ -223,7 +223,7 @@ class OfflineThor:
         self._objects = catalogue(self.state)
         self._places = np.array([b.position for b in self.state.bodies.values()]).reshape(-1, 3)
         self._index = {name: i for i, name in enumerate(self.state.bodies)}
-        self._seen: dict[tuple[float, ...], Any] = {}
+        self._seen = {}
         self._ways: dict[str, tuple[dict[Cell, float], dict[Cell, Cell]]] = {}
 
     def sees(self, body: Body) -> bool:

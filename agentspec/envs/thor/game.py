@@ -84,7 +84,7 @@ class Game(gymnasium.Env[dict[str, Any], str]):
         self.episode_seed: int | None = None
         self.settings = settings
         self._simulator: Any = None
-        self._simulated = {"version": version, "executable": executable, "folders": folders or {}}
+        self._simulated: dict[str, Any] = {"version": version, "executable": executable, "folders": folders or {}}
         self._player = player
 
     # -- what a game is ----------------------------------------------------------------------------------------

@@ -164,7 +164,7 @@ def _in_picture(local: Floats, focal: float, size: tuple[int, int]) -> npt.NDArr
     ahead = np.maximum(local[..., 2], 0.0)
     wide, high = ahead * size[0] / 2 / focal, ahead * size[1] / 2 / focal
     beside = (local[..., 0] > wide).all(1) | (local[..., 0] < -wide).all(1)
-    return ~(beside | (local[..., 1] > high).all(1) | (local[..., 1] < -high).all(1))
+    return np.asarray(~(beside | (local[..., 1] > high).all(1) | (local[..., 1] < -high).all(1)))
 
 
 def _order(centres: Floats, sizes: Floats, eye: Floats, rank: Floats) -> list[int]:
@@ -175,7 +175,7 @@ def _order(centres: Floats, sizes: Floats, eye: Floats, rank: Floats) -> list[in
     low, high = centres - sizes / 2, centres + sizes / 2
     above = (low[:, None] >= high[None] - 0.01) & (eye <= low + 0.01)[:, None]
     below = (high[:, None] <= low[None] + 0.01) & (eye >= high - 0.01)[:, None]
-    harmless = (above | below).any(axis=2)  # [i, j]: i cannot hide j
+    harmless = np.asarray((above | below).any(axis=2))  # [i, j]: i cannot hide j
     first = harmless & ~harmless.T
     waiting = first.sum(axis=0)
     left = np.ones(len(rank), bool)

@@ -163,7 +163,7 @@ class RoboThorLink:
     def _start(self, scene: str) -> Any:
         s, link = self._settings, self
 
-        class Watched(self._module.Controller):  # type: ignore[misc,name-defined]
+        class Watched(self._module.Controller):  # type: ignore[name-defined]
             """A Controller whose player is watched from its start on."""
 
             def _start_unity_thread(self, *args: Any) -> None:

@@ -113,7 +113,7 @@ class Ai2Thor:
 
     def distance(self, target: str) -> float | None:
         """What the simulator's own shortest path measures; not a step of the episode."""
-        asked = {"action": "GetShortestPath", "objectType": target}
+        asked: dict[str, Any] = {"action": "GetShortestPath", "objectType": target}
         asked["position"] = dict(self.observe().metadata["agent"]["position"])
         try:
             told = self._link.step(asked).metadata
