@@ -168,7 +168,7 @@ def check_agent(policy: Policy | None, spec: AgentSpec, env: Any, name: str) -> 
         if isinstance(spec.embedder, Mapping) and "endpoint" in spec.embedder:
             embedder_of(spec.embedder)  # which asks it once
     if not can_simulate(env):
-        spec.check(spec.needs() - {"snapshots"}, f"environment {name!r} without snapshot() and restore()")
+        spec.check(frozenset(spec.needs()) - {"snapshots"}, f"environment {name!r} without snapshot() and restore()")
 
 
 def calls_model(kind: str, name: str) -> bool:
