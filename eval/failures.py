@@ -1,8 +1,8 @@
 """Failures of a matrix: which kinds, how often, per scaffold and beside the paper's shares.
 
-The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`). How far
-to believe either is for labels to say that a reader gave without seeing them: `read_labels` and `replayed` bring such a
-sample, `agreement` gives precision and recall per kind, `kappa` Cohen's kappa. No sample ships yet.
+The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`). How
+far to believe either is for labels to say that a reader gave without seeing them: `read_labels` and `replayed` bring
+such a sample, `agreement` gives precision and recall per kind, `kappa` Cohen's kappa. No sample ships yet.
 """
 
 from __future__ import annotations
