@@ -107,16 +107,16 @@ class MemoryBank:
         """
         try:
             data = json.loads(blob)
-        except ValueError:
+        except (ValueError, RecursionError):
             data = None
         if not isinstance(data, dict) or data.get("kind") != KIND:
             raise ValueError(
                 f"not a memory file; give the {FILE} of a training run, or the .{FILE} beside a file that "
                 "`agentspec run --out` wrote for an agent with `scope: run`"
             )
-        if data["format"] != FORMAT:
+        if data.get("format") != FORMAT:
             raise ValueError(
-                f"a memory file of format {data['format']}, this version reads {FORMAT}; grow the memory again"
+                f"a memory file of format {data.get('format')}, this version reads {FORMAT}; grow the memory again"
             )
         try:
             modules = str(data["modules"]["memory"]), str(data["modules"]["reflection"])
@@ -137,7 +137,7 @@ class MemoryBank:
             try:
                 time, _, _ = (json.loads(state)[part] for part in ("time", "memory", "reflection"))
                 _ = {name: time[name] for name in ("episode", "before", "ids")}
-            except (ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError, RecursionError) as error:
                 raise ValueError(f"{BROKEN} ({type(error).__name__}: {error}); {GROW}") from error
 
 
@@ -207,9 +207,13 @@ async def play_in_order(
     bank = start or MemoryBank.of_spec(runner.spec)
     played: list[Trajectory] = []
     memory = bank.of(jobs[0].task) if jobs else None
+    tell = runner.progress(len(jobs)) if runner.progress else None
+    alone = replace(runner, progress=None)
     for job in jobs:
-        [trajectory] = await runner.run_async([replace(job, memory_state=memory)])
+        [trajectory] = await alone.run_async([replace(job, memory_state=memory)])
         played.append(trajectory)
+        if tell:
+            tell(trajectory)
         if trajectory.scorable:
             memory = trajectory.memory_state
             bank = bank.carried([(job.task.key, 0.0, memory)])

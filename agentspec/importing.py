@@ -35,7 +35,7 @@ def import_module(name: str) -> ModuleType:
 
 
 def _import_file(path: Path) -> ModuleType:
-    if not path.is_file():
+    if not path.is_file() or path.suffix != ".py":
         raise SpecError(f"no file {path} to import; give the path of a Python file, or a module's name")
     loaded = sys.modules.get(path.stem)
     if loaded is not None and getattr(loaded, "__file__", None) == str(path.resolve()):

@@ -36,6 +36,7 @@ from agentspec.parameters import check_parameters, check_types
 from agentspec.protocols import Embedder, Services, StepClock
 from agentspec.registry import REGISTRY, SpecError, import_modules, snake_case
 from agentspec.types import Sampling
+from agentspec.yaml_keys import UniqueLoader
 
 if TYPE_CHECKING:
     from agentspec.agent import Agent
@@ -352,7 +353,9 @@ def load_yaml(source: str | Path) -> Any:
         except ValueError:
             pass
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=UniqueLoader)  # a safe loader
+    except SpecError as error:
+        raise SpecError(f"{where}: {error}; keep one") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         position = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""

@@ -37,6 +37,7 @@ from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.tasks import SPLITS, parse_seeds
 from agentspec.types import Task
+from agentspec.yaml_keys import UniqueLoader
 from eval.cells import Settings
 from eval.limits import Limits
 from eval.matrix import evaluate
@@ -76,7 +77,7 @@ def read_matrix(path: str | Path) -> Matrix:
     if not path.is_file():
         raise SpecError(f"there is no matrix {path}; give a YAML file with policies, scaffolds and tasks")
     try:  # a safe loader
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_Unique)
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=UniqueLoader)
     except yaml.YAMLError as error:
         raise SpecError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
     except SpecError as error:
@@ -85,21 +86,6 @@ def read_matrix(path: str | Path) -> Matrix:
         return _matrix(_mapping(data, "a matrix"), path.parent)
     except SpecError as error:
         raise SpecError(f"{path}: {error}") from error
-
-
-class _Unique(yaml.SafeLoader):
-    """Safe YAML in which no label stands twice: the first would be dropped without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As its base class.
-
-        Raises:
-            SpecError: a key that the mapping has already.
-        """
-        keys = [key.value for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
-        if twice := sorted({str(key) for key in keys if keys.count(key) > 1}):
-            raise SpecError(f"{', '.join(twice)} stands twice, in the mapping at line {node.start_mark.line + 1}")
-        return super().construct_mapping(node, deep=deep)
 
 
 def _matrix(data: Mapping[str, Any], beside: Path) -> Matrix:

@@ -27,12 +27,12 @@ def evaluate_run(config: object, folder: Path) -> None:
     from agentspec.tasks import make_tasks
     from eval.matrix import Policy, evaluate
     from eval.tables import markdown
-    from trainers.config import ScaffoldConfig, agent_spec
+    from trainers.config import ScaffoldConfig
 
     assert isinstance(config, ScaffoldConfig)
     name, options = config.world
     tasks = make_tasks(name, options, config.eval_tasks, split="test")
-    specs = {s.label: s for s in map(agent_spec, config.evaluation_specs)}
+    specs = {s.label: s for s in config.evaluation_specs}
     start = resolve_adapter(config.adapter) if config.adapter else ""
     policies = [
         Policy("start", model=config.model, adapter=start),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,18 @@ def test_episodes_in_order_learn_from_each_other() -> None:
     assert [bank.of(t.task) for t in played] == [t.memory_state for t in played]
 
 
+def test_episodes_in_order_are_counted_as_one_batch() -> None:
+    totals: list[int] = []
+    told: list[object] = []
+
+    def progress(total: int) -> Callable[[object], None]:
+        totals.append(total)
+        return told.append
+
+    played, _ = run_in_order(Runner(SPEC, ScriptedLLM(Idler()), progress=progress), [Job(t) for t in (A, B, C)])
+    assert totals == [3] and told == played
+
+
 def test_a_failed_episode_leaves_the_memory_before_it() -> None:
     idler = Idler()
     broken = Task(TOY, 7, {"fault": "crash"})
@@ -141,6 +154,9 @@ def test_a_start_that_cannot_work_is_refused(tmp_path: Path) -> None:
         (tmp_path / FILE).write_text(text)
         with pytest.raises(SpecError, match=message):
             start_bank(tmp_path, SPEC)
+    for text, message in (("[" * 100_000, "not a memory file"), ('{"kind": "agentspec memory"}', "format None, this")):
+        with pytest.raises(ValueError, match=message):
+            MemoryBank.load(text.encode())
     newer = json.loads(MemoryBank.of_spec(SPEC).dump()) | {"format": 2}
     (tmp_path / FILE).write_text(json.dumps(newer))
     with pytest.raises(SpecError, match="format 2, this version reads 1"):

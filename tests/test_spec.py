@@ -30,6 +30,7 @@ def test_yaml_round_trip() -> None:
         ("sampling: {temperatur: 1}\n", "did you mean temperature"),
         ("sampling: {temperature: -1}\n", "out of range"),
         ("memory: {name: base\n", "malformed YAML in the given text at line 2"),
+        ("memory: base\nmemory: none\n", "memory stands twice, in the mapping at line 1; keep one"),
         ("- react\n- base: 1\n", "a spec is a mapping"),
     ],
 )

@@ -15,7 +15,7 @@ from agentspec.actions import suggest
 from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
-from agentspec.spec import MODULE_KINDS
+from agentspec.spec import MODULE_KINDS, AgentSpec
 from trainers.estimators import ESTIMATORS
 from trainers.fields import REFUSED
 from trainers.losses import LOSSES, loss
@@ -49,7 +49,8 @@ RANGES: dict[tuple[float, float], str] = {
     (0, math.inf): "gigpo_weight epsilon epsilon_high beta learning_rate actor_temperature tokens_per_forward "
     "rollout_concurrency retries lora_r lora_layers lora_alpha",
     (0.001, math.inf): "env_timeout_s",
-    (1, math.inf): "max_completion_length num_iterations train_tasks validation_tasks write_rerolls write_points",
+    (1, math.inf): "max_completion_length num_iterations train_tasks eval_tasks validation_tasks write_rerolls "
+    "write_points",
 }
 """Smallest and largest value that means something -> fields; others would turn a sign around, or be passed over."""
 
@@ -60,7 +61,8 @@ def check(config: ScaffoldConfig) -> None:
     Raises:
         SpecError: what was given, why it cannot work, what to do.
     """
-    _ = config.reward_set, config.world, config.other_specs, config.starting_memory
+    _ = config.reward_set, config.world, config.other_specs, config.starting_memory, config.evaluation_specs
+    AgentSpec.from_data({"sampling": config.evaluation_sampling})
     check_reporters(config)
     for found in (_values, unread_with_a_value, _calls, _writes, _rounds, _vllm):
         for problem in found(config):
@@ -105,6 +107,9 @@ def _values(config: ScaffoldConfig) -> Iterator[str]:
 def _calls(config: ScaffoldConfig) -> Iterator[str]:
     """Something is trained, and sampled so that it can be."""
     spec, train, paths = config.spec, config.train_filter, config.spec.call_paths()
+    for name in ("train_calls", "train_credits"):
+        if not getattr(config, name):
+            yield f"{name} is empty, so nothing would be trained; name some, or leave the field out"
     for name, patterns in (("train_calls", config.train_calls), ("mask_truncated", config.mask_truncated)):
         if missing := unmatched_patterns(paths, TrainFilter(tuple(patterns))):
             there = ", ".join(sorted(set(paths))) or "none (no module calls the model)"

@@ -13,17 +13,22 @@ from trl import GRPOConfig
 
 from agentspec.carry import start_bank
 from agentspec.llm.models import base_of
+from agentspec.parameters import check_types
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
-from trainers.ahead import check_world, structure
+from trainers.ahead import OURS, check_world, structure
 from trainers.checks import check
 from trainers.credit import CreditRule
+from trainers.fields import USED
 from trainers.sequences import TrainFilter
 
 CHECKPOINTING = (
     "activation_checkpointing" if hasattr(GRPOConfig, "activation_checkpointing") else "gradient_checkpointing"
 )
 """What the installed transformers calls recomputing activations; it warns of the older name."""
+
+LISTS = ("train_calls", "train_credits", "mask_truncated", "write_calls", "overlong_ends", "lora_targets")
+"""Lists of texts: one text alone is a list of one."""
 
 
 @dataclass
@@ -134,6 +139,9 @@ class ScaffoldConfig(GRPOConfig):
     def __post_init__(self) -> None:
         for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
             setattr(self, name, structure(getattr(self, name)))
+        for name in LISTS:
+            setattr(self, name, [given] if isinstance(given := getattr(self, name), str) else given)
+        check_types("configuration", type(self), {name: getattr(self, name) for name in _read(self)})
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -173,9 +181,9 @@ class ScaffoldConfig(GRPOConfig):
         return getattr(self.eval_strategy, "value", self.eval_strategy) != "no" or bool(self.eval_on_start)
 
     @property
-    def evaluation_specs(self) -> list[Any]:
+    def evaluation_specs(self) -> list[AgentSpec]:
         """Agent specs to evaluate under after training: the training scaffold if none are named."""
-        return [self.spec] if self.eval_specs is None else _listed(self.eval_specs)
+        return [self.spec] if self.eval_specs is None else [agent_spec(s) for s in _listed(self.eval_specs)]
 
     @property
     def other_specs(self) -> list[AgentSpec]:
@@ -213,3 +221,8 @@ def agent_spec(value: Any) -> AgentSpec:
 
 def _listed(specs: list[Any] | str) -> list[Any]:
     return [specs] if isinstance(specs, str) else list(specs)
+
+
+def _read(config: ScaffoldConfig) -> list[str]:
+    """Names of the fields that are read, as far as the installed TRL has them."""
+    return [name for name in " ".join((*OURS.values(), *USED.values())).split() if hasattr(config, name)]

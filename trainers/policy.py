@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from agentspec.actions import suggest
 from agentspec.llm.base import LLMError
 from agentspec.llm.models import resolve_adapter
 from agentspec.registry import SpecError
@@ -143,8 +144,17 @@ def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
 
 
 def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
-    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection."""
+    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection.
+
+    Raises:
+        SpecError: the model has no such module.
+    """
+    names = [name for name, _ in model.named_modules()]
     if config.lora_targets != ["all-linear"]:
+        there = {name.rpartition(".")[2] for name in names}
+        for target in config.lora_targets or [""]:
+            if not any(f".{name}".endswith(f".{target}") for name in names) or not target:
+                raise SpecError(f"lora_targets: {config.model} has no module {target!r}{suggest(target, there)}")
         return config.lora_targets
     wrapper: Any = model
     head = wrapper.get_output_embeddings()

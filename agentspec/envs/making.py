@@ -60,6 +60,9 @@ def make_env(task: Task) -> Any:
 
     name = environment_id(task.env)
     check_options(name, task.options)
+    mode = task.options.get("render_mode")
+    if not isinstance(mode, str | None):
+        raise SpecError(f"env {name!r}: render_mode must be a text or null, got {mode!r}")
     try:
         env = gymnasium.make(name, disable_env_checker=True, **task.options)
     except TypeError as error:
@@ -99,7 +102,7 @@ def environment_class(name: str) -> Any:
             return entry_point
         module, _, attribute = entry_point.partition(":")
         return getattr(importlib.import_module(module), attribute)
-    except (KeyError, ImportError, AttributeError):
+    except (KeyError, ImportError, AttributeError, gymnasium.error.DependencyNotInstalled):
         return None
 
 

@@ -78,6 +78,14 @@ def test_the_menu_follows_the_mask_of_the_environment() -> None:
     assert info["action_schema"].choices == ("action 1", "action 2") and "action 0" not in observation["text"]
     env.step("action 2")
     assert env.inner.acted == [7]  # the space starts at 5
+    info = env.step("ACTION_0()")[4]  # a call names what the menu leaves out
+    assert env.inner.acted == [7] and info["error"].endswith("is not possible now; possible are action 1; action 2")
+
+
+def test_a_mask_holds_for_large_spaces_too() -> None:
+    env = started(Space(spaces.Discrete(50), told={"action_mask": np.eye(50, dtype=np.int8)[3]}))
+    assert "ACT(4) is not possible now; possible are ACT(3)" in env.step("ACT(4)")[4]["error"]
+    assert not env.step("ACT(3)")[4]["invalid"] and env.inner.acted == [3]
 
 
 @pytest.mark.parametrize(
@@ -99,6 +107,25 @@ def test_large_and_composite_spaces_are_called(space: Any, text: str, value: Any
         assert told["invalid"] and "write ACT(" in told["error"]
     assert len(inner.acted) == 1
     check_environment(TextAdapter(Space(space), "Space-v0"))
+
+
+def test_a_number_is_not_rounded_to_an_action() -> None:
+    env = started(Space(spaces.Discrete(100)))
+    assert "2.7 is none of Discrete(100)" in env.step("ACT(2.7)")[4]["error"] and env.inner.acted == []
+    env = started(Space(spaces.MultiDiscrete([3, 4])))
+    assert env.step("ACT([1.5, 2])")[4]["invalid"] and env.inner.acted == []
+
+
+def test_an_environment_that_cannot_be_made_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SpecError, match="render_mode must be a text or null, got 5"):
+        make_env(Task("CartPole-v1", options={"render_mode": 5}))
+
+    def missing(name: str) -> Any:
+        raise gymnasium.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr("agentspec.envs.making.importlib.import_module", missing)
+    with pytest.raises(SpecError, match=r"LunarLander-v3 needs a package that is not installed: "):
+        make_env(Task("LunarLander-v3"))
 
 
 def test_continuous_actions_are_refused() -> None:

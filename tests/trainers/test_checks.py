@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +19,13 @@ pytest.importorskip("trl")
 import accelerate
 import transformers
 import trl
+import yaml
 from trl import GRPOConfig
 
+from agentspec.cli.errors import is_expected
 from agentspec.declaration import Declaration
 from agentspec.registry import REGISTRY, Entry, SpecError
+from trainers.ahead import OURS
 from trainers.arguments import parse_config
 from trainers.checks import check_given, check_reporters, notes
 from trainers.config import ScaffoldConfig
@@ -31,6 +38,52 @@ RULES = field_rules(GRPOConfig)
 
 def config(tmp_path: Path, **changes: Any) -> ScaffoldConfig:
     return ScaffoldConfig(output_dir=str(tmp_path), use_cpu=True, bf16=False, report_to=[], **changes)
+
+
+HOSTILE = ([[1]], {"a": 1}, date(2020, 1, 1))
+
+
+@pytest.mark.parametrize("heading", [*OURS, *USED])
+def test_a_value_of_the_wrong_kind_is_one_line(tmp_path: Path, heading: str) -> None:
+    """Whatever a YAML file holds, under any of the names: it works, or our own check says why not."""
+    source = tmp_path / "c.yaml"
+    for name in {**OURS, **USED}[heading].split():
+        for value in HOSTILE:
+            given = {"output_dir": str(tmp_path), "use_cpu": True, "bf16": False, "report_to": "none", name: value}
+            source.write_text(yaml.safe_dump(given), encoding="utf-8")
+            with expected_errors_only(f"{name}: {value!r}"):
+                parse_config(["--config", str(source)], default=source).check()
+
+
+@contextmanager
+def expected_errors_only(what: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        assert is_expected(error), f"{what} ended in {type(error).__name__}: {error}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lora_r": 1.5}, "lora_r must be a whole number, got 1.5"),
+        ({"adapter": ["x"]}, "adapter must be a text, got "),
+        ({"eval_specs": {"reasoning": "direct"}}, "eval_specs must be a list or a text or null"),
+        ({"eval_specs": [{"reasoning": "directt"}]}, "unknown reasoning 'directt'; did you mean direct"),
+        ({"eval_sampling": {"temperatur": 0.0}}, "unknown key 'temperatur' in sampling; did you mean temperature"),
+        ({"eval_tasks": 0}, "eval_tasks is 0; expected a number of at least 1"),
+        ({"train_calls": []}, "train_calls is empty, so nothing would be trained"),
+        ({"train_credits": []}, "train_credits is empty, so nothing would be trained"),
+    ],
+)
+def test_what_would_fail_after_training_is_told_before(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=re.escape(message)):
+        config(tmp_path, **changes).check()
+
+
+def test_one_text_is_a_list_of_one(tmp_path: Path) -> None:
+    given = config(tmp_path, train_calls="reasoning.*", lora_targets="q_proj")
+    assert (given.train_calls, given.lora_targets) == (["reasoning.*"], ["q_proj"])
 
 
 # --- the table -------------------------------------------------------------------------------------------------------

@@ -132,16 +132,20 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
         space = self.inner.action_space
         if not isinstance(space, spaces.Discrete) or space.n > MENU:
             return ()
+        return tuple(text for text, possible in zip(self.names.actions, self._allowed(), strict=True) if possible)
+
+    def _allowed(self) -> Any:
+        """Which actions of a `Discrete` space the environment offers now, shape (n,); all where it masks none."""
         mask = self._told.get("action_mask") if isinstance(self._told, Mapping) else None
-        allowed = np.ones(int(space.n), bool) if mask is None or not np.any(mask) else np.asarray(mask, bool)
-        return tuple(text for text, possible in zip(self.names.actions, allowed, strict=True) if possible)
+        n = int(self.inner.action_space.n)
+        return np.ones(n, bool) if mask is None or not np.any(mask) else np.asarray(mask, bool)
 
     def _value(self, action: Action) -> Any:
         """The element of the action space, or what is wrong with the action's arguments."""
         space = self.inner.action_space
         if isinstance(space, spaces.Discrete) and action.name != CALL:
             named = [action.name in (text, call_name(text)) for text in self.names.actions]
-            return int(space.start) + named.index(True)
+            return self._offered(int(space.start) + named.index(True), action)
         given = [*action.args, *action.kwargs.values()]
         example = self._specs[CALL].example
         if len(given) != 1:
@@ -150,11 +154,22 @@ class TextAdapter(gymnasium.Env[dict[str, Any], str]):
         if not isinstance(space, spaces.Text):
             try:
                 value = np.asarray(value, dtype=space.dtype) if space.shape else int(value)
+                if not np.array_equal(value, np.asarray(given[0], dtype=float).reshape(space.shape)):
+                    value = None  # 2.7 is not 2
             except (TypeError, ValueError, OverflowError):
                 value = None
         if value is None or not space.contains(value):
             return ActionError("RANGE", f"{given[0]!r} is none of {space}; write {example}", action.text)
-        return value
+        return self._offered(value, action) if isinstance(space, spaces.Discrete) else value
+
+    def _offered(self, value: int, action: Action) -> Any:
+        """`value`, or that the environment does not allow it now: a call may name what the menu leaves out."""
+        allowed, start = self._allowed(), int(self.inner.action_space.start)
+        if allowed[value - start]:
+            return value
+        now = [self.names.actions[i] if self._choices() else f"{CALL}({start + i})" for i in np.flatnonzero(allowed)]
+        shown = "; ".join(now[:MENU])
+        return ActionError("NOT_OFFERED", f"{action.text} is not possible now; possible are {shown}", action.text)
 
     def _show(self, terminated: bool, truncated: bool, error: str, code: str) -> tuple[dict[str, Any], dict[str, Any]]:
         """The observation and info of now."""
