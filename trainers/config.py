@@ -141,7 +141,12 @@ class ScaffoldConfig(GRPOConfig):
             setattr(self, name, structure(getattr(self, name)))
         for name in LISTS:
             setattr(self, name, [given] if isinstance(given := getattr(self, name), str) else given)
-        check_types("configuration", type(self), {name: getattr(self, name) for name in _read(self)})
+        # Inherited fields may be None where their types do not say so (`debug`, from the command line).
+        inherited = {name for names in USED.values() for name in names.split()}
+        values = {name: getattr(self, name) for name in _read(self)}
+        check_types(
+            "configuration", type(self), {n: v for n, v in values.items() if v is not None or n not in inherited}
+        )
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
