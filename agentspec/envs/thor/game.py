@@ -294,7 +294,7 @@ def check_folders(used: bool, **folders: str) -> None:
     for name, folder in folders.items():
         if folder and not used:
             raise ValueError(
-                f"{name} is {folder!r}, but the suite `own` reads no data; leave it out, or name what does"
+                f"{name} is {folder!r}, but the suite `own` reads no data; leave it out, or choose another"
             )
         if folder and not Path(folder).is_dir():
             raise NoData(f"{name} is {folder!r}: there is no such folder")
