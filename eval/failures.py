@@ -1,8 +1,8 @@
 """Failures of a matrix: which kinds, how often, per scaffold and beside the paper's shares.
 
-The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`); how
-far to believe it is measured as Cohen's kappa against a labelled sample (`data/failure_labels.jsonl`, whose first line
-says who read it and how), and the rules' precision and recall against the same sample.
+The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`). How
+far to believe either is for labels to say that a reader gave without seeing them: `read_labels` and `replayed` bring
+such a sample, `agreement` gives precision and recall per kind, `kappa` Cohen's kappa. No sample ships yet.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from agentspec.actions import parse_action
 from agentspec.episode import make_env
 from agentspec.failures import LEAVES, Sign, is_failure, leading, signs
-from agentspec.files import jsonable
+from agentspec.files import jsonable, read_lines
 from agentspec.llm.base import LLM, Message, Request
 from agentspec.perception.generic import GenericPerception
 from agentspec.simulator import OBJECTS_IN_INFO
@@ -28,7 +28,6 @@ from agentspec.types import ActionError, CallTag, Decision, Sampling, Task, Tran
 
 OPEN = "open"
 """Failures that no rule explains and nobody judged."""
-LABELS = Path(__file__).with_name("data") / "failure_labels.jsonl"
 
 
 @dataclass(frozen=True)
@@ -224,13 +223,19 @@ def kappa(a: Sequence[str], b: Sequence[str]) -> float:
     return 1.0 if expected == 1 else (observed - expected) / (1 - expected)
 
 
-def read_labels(path: Path = LABELS) -> list[dict[str, Any]]:
-    """The labelled sample: `{"task": {...}, "actions": [...], "label": leaf, "why": ...}` per line after the first.
+def read_labels(path: str | Path) -> list[dict[str, Any]]:
+    """A labelled sample: `{"task": {...}, "actions": [...], "label": leaf, "why": ...}` per line.
 
     An episode is kept as the texts that were executed; `replayed` plays them again.
+
+    Raises:
+        ValueError: naming file and line of what is no JSON object, or a label that is no kind of failure.
     """
-    lines = path.read_text(encoding="utf-8").splitlines()[1:]
-    return [json.loads(line) for line in lines if line.strip()]
+    found = read_lines(path)
+    for number, record in enumerate(found, 1):
+        if record.get("label") not in LEAVES:
+            raise ValueError(f"{path}, line {number}: {record.get('label')!r} is none of {', '.join(LEAVES)}")
+    return found
 
 
 def replayed(task: Task, actions: Sequence[str]) -> Trajectory:

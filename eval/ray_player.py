@@ -90,6 +90,7 @@ class RayPlayer:
         """
         from ray.exceptions import RayActorError
 
+        why = ""
         for _ in range(MOST_DEATHS):
             i = min(range(len(self._actors)), key=self._busy.__getitem__)
             actor = self._actors[i]
@@ -98,12 +99,13 @@ class RayPlayer:
                 played: Played = await asyncio.wrap_future(actor.play.remote(cell, job).future())
                 return played
             except RayActorError as error:
+                why = " ".join(str(error).split())[-300:]  # its end says what the worker raised, a model not found say
                 if self._actors[i] is actor:  # the first of its episodes to notice starts another
                     print(f"a worker died ({type(error).__name__}); starting another", file=sys.stderr, flush=True)
                     self._actors[i] = self._start()
             finally:
                 self._busy[i] -= 1
-        raise RuntimeError(f"{MOST_DEATHS} workers died while they played {job.task.key}")
+        raise RuntimeError(f"{MOST_DEATHS} workers died while they played {job.task.key}: {why}")
 
     def __enter__(self) -> RayPlayer:
         return self

@@ -211,6 +211,8 @@ def compare_runs(
     if len(a) == 1 and len(b) >= LEAST_RUNS:
         turned = compare_runs(b, a, level=level, seed=seed)
         return replace(turned, mean=-turned.mean, low=-turned.high, high=-turned.low)
+    if not a or not b:
+        return Estimate(math.nan, math.nan, math.nan, 0, note="one side has no run with a value")
     common = _common([*a, *b])
     if len(a) >= LEAST_RUNS and (len(b) == 1 or len(b) >= LEAST_RUNS):
         if not common:

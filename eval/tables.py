@@ -153,7 +153,7 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
             if compared:
                 caption = differences_caption(compared, level)
                 parts += [f"Paired differences in {heading}, by {by} ({caption}):", ""]
-                parts += [*_differences(compared, by, digits), ""]
+                parts += [*table(*difference_rows(compared, by, digits)), ""]
     return "\n".join(parts)
 
 
@@ -242,17 +242,18 @@ def _details(cells: Sequence[CellSummary]) -> list[str]:
     return table(header, body)
 
 
-def _differences(rows: Sequence[Row], by: str, digits: int) -> list[str]:
+def difference_rows(compared: Sequence[Row], by: str, digits: int) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a table of differences; the verdict is a dash where there is nothing to compare."""
     fixed = "scaffold" if by == "policy" else "policy"
     body = []
-    for row in rows:
+    for row in compared:
         numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high")]
         estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        p = show_p(row["p"])
-        verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
+        verdict = "–" if row["mean"] is None else "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
         counted = f"{row['n']} {row['unit']}s"
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, digits), p, verdict, counted])
-    return table([fixed, "difference", "mean", "p", "verdict", "n"], body)
+        names = [row[fixed], f"{row[by]} - {row['baseline']}"]
+        body.append([*names, show(estimate, digits), show_p(row["p"]), verdict, counted])
+    return [fixed, "difference", "mean", "p", "verdict", "n"], body
 
 
 def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:

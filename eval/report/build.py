@@ -8,27 +8,26 @@ repeats a number is taken, and what its interval is.
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
-import json
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from agentspec.files import file_digest, read_lines, write_atomic
-from agentspec.metrics import PLAIN, Metric, columns, primary_metric
-from eval.naming import slug
+from agentspec.metrics import Metric, columns, primary_metric
 from eval.report import figures
 from eval.report.blocks import Block, Figure, Heading, Table, Text, to_html, to_latex, to_markdown
+from eval.report.captions import LEVEL, acts, name_of, unit_of
+from eval.report.costs import costs_section, fronts_section
+from eval.report.data import as_csv, as_parquet
+from eval.report.modules import modules_section
 from eval.report.sections import failures_section, learning_section, paper_section
-from eval.statistics import Estimate, interactions, least_p, minimum_detectable_effect, runs_mean
-from eval.tables import differences, differences_caption, show, show_p, summarise, values_by_run
+from eval.statistics import Estimate, least_p, minimum_detectable_effect, runs_mean
+from eval.tables import difference_rows, differences, differences_caption, show, summarise, values_by_run
 
 Row = Mapping[str, Any]
-LEVEL = 0.95
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,16 @@ def build_report(
     blocks: list[Block] = [Heading(title or "Evaluation", 1), *_overview(rows, path)]
     for tasks in dict.fromkeys(str(row["tasks"]) for row in rows):
         members = [row for row in rows if row["tasks"] == tasks]
-        blocks += [Heading(tasks), *_cells(tasks, members), *_modules(tasks, members), *_fronts(tasks, members)]
+        blocks += [
+            Heading(tasks),
+            *_cells(tasks, members),
+            *modules_section(tasks, members),
+            *fronts_section(tasks, members),
+        ]
     blocks += _worlds(rows)
     blocks += learning_section(runs or {})
     blocks += failures_section(rows, path.parent, paper=paper)
-    blocks += _costs(rows)
+    blocks += costs_section(rows)
     if paper:
         blocks += paper_section(rows)
     return Report(title or "Evaluation", blocks, rows)
@@ -93,12 +97,12 @@ def write_files(report: Report, folder: str | Path) -> list[Path]:
         "report.html": to_html(report.blocks, report.title),
         "report.md": to_markdown(report.blocks),
         "report.tex": to_latex(report.blocks),
-        "episodes.csv": _csv(report.rows),
+        "episodes.csv": as_csv(report.rows),
     }
     for figure in drawn:
         files |= {f"figures/{figure.name}.svg": figure.svg, f"figures/{figure.name}.png": figure.png}
     with contextlib.suppress(ImportError):  # the CSV says the same; pyarrow comes with the extra `train`
-        files["episodes.parquet"] = _parquet(report.rows)
+        files["episodes.parquet"] = as_parquet(report.rows)
     for name, data in files.items():
         write_atomic(folder / name, data)
     return [folder / name for name in files]
@@ -118,7 +122,7 @@ def _overview(rows: Sequence[Row], path: Path) -> list[Block]:
         body.append([policy, str(len(runs)), str(len({r["task"] for r in mine})), f"{played} of {len(mine)}"])
     agents = []
     for scaffold in dict.fromkeys(row["scaffold"] for row in rows):
-        agent: Mapping[str, str] = next((r["agent"] for r in rows if r["scaffold"] == scaffold and _acts(r)), {})
+        agent: Mapping[str, str] = next((r["agent"] for r in rows if r["scaffold"] == scaffold and acts(r)), {})
         agents.append(
             [scaffold, *(str(agent.get(k, "–")) for k in ("reasoning", "memory", "reflection", "layout", "scope"))]
         )
@@ -134,32 +138,17 @@ def _overview(rows: Sequence[Row], path: Path) -> list[Block]:
     ]
 
 
-def _acts(row: Row) -> bool:
-    return bool(row.get("agent")) and row["agent"].get("reasoning") not in ("rule_based", "random")
-
-
-def _unit(rows: Sequence[Row]) -> str:
-    """What a caption says of the numbers: tasks, repeats, runs."""
-    tasks = len({row["task"] for row in rows})
-    repeats = len({row["rollout"] for row in rows})
-    runs = {p: len({r.get("run", "") for r in rows if r["policy"] == p}) for p in {r["policy"] for r in rows}}
-    several = max(runs.values())
-    over = f" of up to {several} training runs" if several > 1 else ""
-    unit = "over training runs where there are three and more, else over tasks" if several > 1 else "over tasks"
-    return f"n = {tasks} tasks x {repeats} repeats{over}; {LEVEL:.0%} t intervals {unit}"
-
-
 def _cells(tasks: str, rows: Sequence[Row]) -> list[Block]:
     cells, metric = summarise(rows, level=LEVEL), primary_metric(rows)
     policies, scaffolds = ([*dict.fromkeys(getattr(c, k) for c in cells)] for k in ("policy", "scaffold"))
     values = {(c.policy, c.scaffold): c.estimates[metric.name] for c in cells if metric.name in c.estimates}
     body = [[p, *(show(values.get((p, s)), metric.digits) for s in scaffolds)] for p in policies]
-    unit = _unit(rows)
+    unit = unit_of(rows)
     blocks: list[Block] = [
         Heading(f"{tasks}: policy x scaffold", 3),
         Table(["policy", *scaffolds], body, f"{metric.heading}; {unit}."),
         figures.heat_map(
-            f"{_name(tasks)}-matrix",
+            f"{name_of(tasks)}-matrix",
             policies,
             scaffolds,
             values,
@@ -172,25 +161,12 @@ def _cells(tasks: str, rows: Sequence[Row]) -> list[Block]:
     for by in ("policy", "scaffold"):
         compared = differences(rows, metric.name, by=by, level=LEVEL)
         if compared:
-            blocks.append(_difference_table(compared, by, metric))
+            caption = f"Differences in {metric.heading}, by {by}: {differences_caption(compared, LEVEL)}."
+            blocks.append(Table(*difference_rows(compared, by, metric.digits), caption))
     blocks.append(_details(cells, columns(rows)))
     if text := _detectable(rows, metric):
         blocks.append(Text(text))
     return blocks
-
-
-def _difference_table(compared: Sequence[Mapping[str, Any]], by: str, metric: Metric) -> Table:
-    fixed = "scaffold" if by == "policy" else "policy"
-    body = []
-    for row in compared:
-        numbers = [math.nan if row[k] is None else row[k] for k in ("mean", "low", "high", "p")]
-        estimate = Estimate(numbers[0], numbers[1], numbers[2], row["n"])
-        verdict = "tie" if row["tie"] else "higher" if row["mean"] > 0 else "lower"
-        p = show_p(numbers[3])
-        counted = f"{row['n']} {row['unit']}s"
-        body.append([row[fixed], f"{row[by]} - {row['baseline']}", show(estimate, metric.digits), p, verdict, counted])
-    caption = f"Differences in {metric.heading}, by {by}: {differences_caption(compared, LEVEL)}."
-    return Table([fixed, "difference", "mean", "p", "verdict", "n"], body, caption)
 
 
 def _details(cells: Sequence[Any], metrics: Sequence[Metric]) -> Table:
@@ -237,119 +213,6 @@ def _detectable(rows: Sequence[Row], metric: Metric) -> str:
     )
 
 
-def _modules(tasks: str, rows: Sequence[Row]) -> list[Block]:
-    """Reasoning x memory, per policy; reflection, if there is more than one."""
-    blocks: list[Block] = []
-    metric = primary_metric(rows)
-    acting = [row for row in rows if _acts(row)]
-    for policy in dict.fromkeys(row["policy"] for row in acting):
-        mine = [row for row in acting if row["policy"] == policy and row["agent"]["reflection"] == "none"]
-        reasoning, memory = ([*dict.fromkeys(r["agent"][k] for r in mine)] for k in ("reasoning", "memory"))
-        if len(reasoning) < 2 or len(memory) < 2:
-            continue
-        values = {}
-        for a in reasoning:
-            for b in memory:
-                members = [r for r in mine if (r["agent"]["reasoning"], r["agent"]["memory"]) == (a, b)]
-                runs = [v for v in values_by_run(members, metric.name).values() if v]
-                if runs:
-                    values[a, b] = runs_mean(runs, level=LEVEL)
-        blocks += [
-            Heading(f"{tasks}: reasoning x memory, {policy}", 3),
-            figures.heat_map(
-                f"{_name(tasks)}-modules-{_name(policy)}",
-                reasoning,
-                memory,
-                values,
-                heading=metric.heading,
-                digits=metric.digits,
-                higher_is_better=metric.higher_is_better,
-                caption=f"{policy}: {metric.heading} by reasoning and memory; {_unit(mine)}.",
-            ),
-            *_interactions(mine, metric),
-        ]
-    kinds = dict.fromkeys(row["agent"]["reflection"] for row in acting)
-    if len(kinds) > 1:
-        blocks += [Heading(f"{tasks}: reflection", 3), _reflection(tasks, acting, [*kinds], metric)]
-    return blocks
-
-
-def _interactions(rows: Sequence[Row], metric: Metric) -> list[Block]:
-    flat = [
-        {
-            "seed": r.get("run") or r["task"],
-            "reasoning": r["agent"]["reasoning"],
-            "memory": r["agent"]["memory"],
-            "y": r[metric.name],
-        }
-        for r in rows
-        if r["status"] == "completed" and r.get(metric.name) is not None
-    ]
-    try:
-        found = interactions(flat, "y", ("reasoning", "memory"))
-    except ValueError as error:
-        return [Text(f"Interactions are not estimated: {error}.")]
-    body = [
-        [f"{a} x {b}", show(e, metric.digits), show_p(e.p), "tie" if e.tie() else "interaction"]
-        for (a, b), e in found.items()
-    ]
-    caption = (
-        f"Interactions in {metric.heading}: how far a combination is from the sum of its parts; OLS, errors clustered "
-        f"by task (by training run where there are runs; {next(iter(found.values())).n} clusters), p corrected by Holm "
-        "over the table. Whatever else scaffolds differ in (layout, parameters) is averaged."
-    )
-    return [Table(["combination", "effect", "p", "verdict"], body, caption)]
-
-
-def _reflection(tasks: str, rows: Sequence[Row], kinds: Sequence[str], metric: Metric) -> Figure:
-    series: dict[str, dict[str, Estimate]] = {}
-    for policy in dict.fromkeys(row["policy"] for row in rows):
-        for kind in kinds:
-            members = [r for r in rows if r["policy"] == policy and r["agent"]["reflection"] == kind]
-            runs = [v for v in values_by_run(members, metric.name).values() if v]
-            if runs:
-                series.setdefault(policy, {})[kind] = runs_mean(runs, level=LEVEL)
-    caption = f"{tasks}: {metric.heading} by reflection, all scaffolds that have it together; {_unit(rows)}."
-    return figures.bars(f"{_name(tasks)}-reflection", kinds, series, heading=metric.heading, caption=caption)
-
-
-def _fronts(tasks: str, rows: Sequence[Row]) -> list[Block]:
-    metric = primary_metric(rows)
-    cells = summarise(rows, level=LEVEL)
-    blocks: list[Block] = []
-    for name in ("tokens", "thinking_s_per_step"):
-        points = []
-        for c in cells:
-            cost = _tokens(c.estimates) if name == "tokens" else _mean(c.estimates.get(name))
-            value = _mean(c.estimates.get(metric.name))
-            if cost and value is not None and cost > 0:
-                points.append((c.policy, c.scaffold, cost, value))
-        if len(points) < 2:
-            continue
-        heading = "tokens per step, in and out" if name == "tokens" else PLAIN[name].heading
-        blocks.append(
-            figures.pareto(
-                f"{_name(tasks)}-pareto-{'tokens' if name == 'tokens' else 'time'}",
-                points,
-                x_heading=heading,
-                y_heading=metric.heading,
-                higher_is_better=metric.higher_is_better,
-                caption=f"{tasks}: {metric.heading} against {heading}; means, {_unit(rows).split(';')[0]}. "
-                "Dashed: nobody is cheaper and as good.",
-            )
-        )
-    return [Heading(f"{tasks}: what it costs", 3), *blocks] if blocks else []
-
-
-def _tokens(estimates: Mapping[str, Estimate]) -> float | None:
-    parts = [_mean(estimates.get(f"{side}_tokens_per_step")) for side in ("input", "output")]
-    return None if None in parts else sum(p for p in parts if p is not None)
-
-
-def _mean(estimate: Estimate | None) -> float | None:
-    return None if estimate is None or math.isnan(estimate.mean) else estimate.mean
-
-
 def _worlds(rows: Sequence[Row]) -> list[Block]:
     """Success in every world that has it."""
     having = [row for row in rows if row.get("success") is not None]
@@ -366,91 +229,5 @@ def _worlds(rows: Sequence[Row]) -> list[Block]:
     body = [[name, *(show(values.get(w), 2) for w in worlds)] for name, values in series.items()]
     return [
         Heading("Success by world"),
-        Table(["policy / scaffold", *worlds], body, f"Share of tasks achieved; {_unit(having)}."),
+        Table(["policy / scaffold", *worlds], body, f"Share of tasks achieved; {unit_of(having)}."),
     ]
-
-
-def _costs(rows: Sequence[Row]) -> list[Block]:
-    """Tokens, dollars and time by module."""
-    body = []
-    for policy, scaffold in dict.fromkeys((r["policy"], r["scaffold"]) for r in rows):
-        sums: dict[str, list[float]] = {}
-        steps = 0
-        for row in rows:
-            if (row["policy"], row["scaffold"]) == (policy, scaffold):
-                steps += row.get("steps") or 0
-                stepped = row["status"] == "completed"  # a failed episode has no count of its steps
-                for module, taken in row.get("modules", {}).items():
-                    total = sums.setdefault(module, [0.0] * 5)
-                    for i, key in enumerate(("calls", "input_tokens", "output_tokens", "cost", "latency_s")):
-                        total[i] += taken[key] if stepped or i >= 3 else 0.0
-        for module, (calls, tokens_in, tokens_out, dollars, seconds) in sums.items():
-            per = max(1, steps)
-            body.append(
-                [
-                    f"{policy} / {scaffold}",
-                    module,
-                    f"{calls / per:.2f}",
-                    f"{tokens_in / per:,.0f}",
-                    f"{tokens_out / per:,.1f}",
-                    f"{dollars:.4f}",
-                    f"{seconds:,.0f}",
-                ]
-            )
-    if not body:
-        return []
-    header = [
-        "policy / scaffold",
-        "module",
-        "calls/step",
-        "tokens in/step",
-        "tokens out/step",
-        "$ in all",
-        "seconds in all",
-    ]
-    return [
-        Heading("Costs by module"),
-        Table(
-            header,
-            body,
-            "Per step of the completed episodes; in all: failed ones too. Seconds are wall-clock, batches shared.",
-        ),
-    ]
-
-
-# -- data files ------------------------------------------------------------------------------------
-
-
-def _flat(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    flat = []
-    for row in rows:
-        plain = {k: v for k, v in row.items() if not isinstance(v, Mapping | list)}
-        plain |= {f"agent_{k}": v for k, v in row.get("agent", {}).items()}
-        flat.append(plain | {"options": json.dumps(row.get("options", {}), sort_keys=True)})
-    return flat
-
-
-def _csv(rows: Sequence[Row]) -> str:
-    flat = _flat(rows)
-    names = list(dict.fromkeys(name for row in flat for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue()
-
-
-def _parquet(rows: Sequence[Row]) -> bytes:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    flat = _flat(rows)
-    names: Iterable[str] = dict.fromkeys(name for row in flat for name in row)
-    table = pa.table({name: pa.array([row.get(name) for row in flat]) for name in names})
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    return buffer.getvalue()
-
-
-def _name(text: str) -> str:
-    return slug(text).replace("_", "-")

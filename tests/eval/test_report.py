@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -20,6 +21,7 @@ from agentspec.types import Task
 from eval.matrix import evaluate
 from eval.report import build_report, write_files
 from eval.report.blocks import Figure, Table, Text, to_html, to_latex
+from eval.report.data import as_parquet
 from eval.report.figures import pareto_front
 from tests.toy_env import TOY
 
@@ -160,3 +162,10 @@ def test_too_few_tasks_promise_no_difference_and_labels_keep_their_pictures(tmp_
     assert any("5 paired tasks are too few" in block.text for block in report.blocks if isinstance(block, Text))
     names = [block.name for block in report.blocks if isinstance(block, Figure)]
     assert len(set(names)) == len(names)
+
+
+def test_a_column_of_mixed_kinds_is_text() -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = [{"policy": "p", "score": True}, {"policy": "q", "score": 0.5}, {"policy": "r", "score": None}]
+    read = parquet.read_table(io.BytesIO(as_parquet(rows))).to_pydict()
+    assert read["policy"] == ["p", "q", "r"] and read["score"] == ["True", "0.5", None]

@@ -159,6 +159,14 @@ def test_it_does_not_matter_which_side_is_the_recipe() -> None:
     assert (theirs.p, theirs.n, theirs.unit) == (ours.p, 3, "run") and ours.p > 0.05
 
 
+@pytest.mark.parametrize("runs", [1, 3])
+def test_a_side_without_any_value_is_not_a_side_of_zeros(runs: int) -> None:
+    played = [{k: 5.0 + run for k in range(8)} for run in range(runs)]
+    for a, b in ((played, []), ([], played)):
+        estimate = compare_runs(a, b)
+        assert math.isnan(estimate.mean) and math.isnan(estimate.p) and estimate.n == 0 and estimate.tie()
+
+
 def test_the_mean_of_runs_without_a_common_task_is_no_number() -> None:
     estimate = runs_mean([{"a": 1.0}, {"b": 2.0}, {"c": 3.0}])
     assert math.isnan(estimate.mean) and (estimate.n, estimate.unit) == (0, "run") and estimate.note

@@ -148,3 +148,11 @@ def test_a_table_with_too_few_tasks_says_that_it_can_only_tie() -> None:
     rows = [row(p, f"t{i}", 10.0 * k + i) for k, p in enumerate(policies) for i in range(9)]
     compared = differences(rows, "hourly_profit")
     assert not any(r["tie"] for r in compared) and "it takes" not in differences_caption(compared)
+
+
+def test_a_policy_without_a_score_has_no_differences() -> None:
+    rows = [row("base", f"t{i}", None, status="unplayed") for i in range(8)]
+    rows += [row("tuned", f"t{i}", 5.0 + i) for i in range(8)]
+    [compared] = differences(rows, "hourly_profit")
+    assert (compared["mean"], compared["p"], compared["n"]) == (None, None, 0) and compared["tie"]
+    assert "| plain | tuned - base | – | – | \N{EN DASH} | 0 seeds |" in markdown(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
+from agentspec.envs.minigrid.view import AHEAD, HEADINGS
 from agentspec.failures import Sign, in_a_row, revisits
 from agentspec.trajectory import Trajectory
 
@@ -21,14 +22,23 @@ def _moves(trajectory: Trajectory) -> Iterator[Sign]:
     messages = [str(t.info.get("message", "")) for t in steps]
     for i in in_a_row([message.startswith("could not go forward") for message in messages]):
         yield Sign("grounding/spatial/stuck", steps[i].step, messages[i])
-    # What is seen, without what counts down; the same view and the same action a third time lead nowhere new.
+    # What is seen, without what counts down, and where: the same action there a third time leads nowhere new. Far from
+    # the walls of a hall all views are alike, so the view alone does not say that the agent is where it was.
     views = [{k: v for k, v in t.input.state.items() if k not in ("steps_left", "history")} for t in steps]
-    for i in revisits(
-        [(json.dumps(view, sort_keys=True), t.action_text) for view, t in zip(views, steps, strict=True)]
-    ):
-        yield Sign(
-            "grounding/spatial/stuck", steps[i].step, "the same action in the same view for the third time or more"
-        )
+    seen = [json.dumps([place, view], sort_keys=True) for place, view in zip(_places(trajectory), views, strict=True)]
+    for i in revisits([(there, t.action_text) for there, t in zip(seen, steps, strict=True)]):
+        yield Sign("grounding/spatial/stuck", steps[i].step, "the same action at the same place a third time or more")
+
+
+def _places(trajectory: Trajectory) -> list[tuple[int, int]]:
+    """Where each step began, from the start: counted along, for the agent is not told."""
+    x, y, places = 0, 0, []
+    for t in trajectory.transitions:
+        places.append((x, y))
+        if t.info.get("message") == "went forward":
+            dx, dy = AHEAD[HEADINGS.index(str(t.input.state["heading"]))]
+            x, y = x + int(dx), y + int(dy)
+    return places
 
 
 def _nothing(trajectory: Trajectory) -> Iterator[Sign]:
