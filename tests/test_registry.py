@@ -137,3 +137,9 @@ def test_every_class_is_of_the_kind_it_is_listed_under() -> None:
     for kind in ("perception", "memory", "reasoning", "reflection"):
         for entry in REGISTRY.all(kind).values():
             assert kind_of(entry.load()) == kind and entry.summary
+
+
+def test_a_file_that_is_no_python_is_not_imported(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("pass\n", encoding="utf-8")
+    with pytest.raises(SpecError, match=r"no file .*notes\.txt to import; give the path of a Python file"):
+        import_modules([str(tmp_path / "notes.txt")])

@@ -141,12 +141,7 @@ class ScaffoldConfig(GRPOConfig):
             setattr(self, name, structure(getattr(self, name)))
         for name in LISTS:
             setattr(self, name, [given] if isinstance(given := getattr(self, name), str) else given)
-        # Inherited fields may be None where their types do not say so (`debug`, from the command line).
-        inherited = {name for names in USED.values() for name in names.split()}
-        values = {name: getattr(self, name) for name in _read(self)}
-        check_types(
-            "configuration", type(self), {n: v for n, v in values.items() if v is not None or n not in inherited}
-        )
+        check_types("configuration", type(self), _given(self))
         if self.validates:
             self.metric_for_best_model = getattr(self, "metric_for_best_model", None) or "reward"
             self.num_generations_eval = 1  # TRL's rows per task: validation plays each task once
@@ -228,6 +223,8 @@ def _listed(specs: list[Any] | str) -> list[Any]:
     return [specs] if isinstance(specs, str) else list(specs)
 
 
-def _read(config: ScaffoldConfig) -> list[str]:
-    """Names of the fields that are read, as far as the installed TRL has them."""
-    return [name for name in " ".join((*OURS.values(), *USED.values())).split() if hasattr(config, name)]
+def _given(config: ScaffoldConfig) -> dict[str, Any]:
+    """The fields that are read and their values; TRL's own are `None` where their parser leaves them out."""
+    inherited = {n: getattr(config, n, None) for names in USED.values() for n in names.split()}
+    ours = {n: getattr(config, n) for names in OURS.values() for n in names.split()}
+    return {name: value for name, value in inherited.items() if value is not None} | ours

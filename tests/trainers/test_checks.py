@@ -81,6 +81,14 @@ def test_what_would_fail_after_training_is_told_before(tmp_path: Path, changes: 
         config(tmp_path, **changes).check()
 
 
+@pytest.mark.parametrize("name", sorted(p.stem for p in (ROOT / "recipes" / "configs").glob("*.yaml")))
+def test_every_shipped_configuration_is_read(tmp_path: Path, name: str) -> None:
+    source = ROOT / "recipes" / "configs" / f"{name}.yaml"
+    on_cpu = ["--use_cpu", "true", "--bf16", "false", "--use_vllm", "false"]
+    given = parse_config(["--config", str(source), "--output_dir", str(tmp_path), *on_cpu], default=source)
+    assert given.output_dir == str(tmp_path) and given.spec.label
+
+
 def test_one_text_is_a_list_of_one(tmp_path: Path) -> None:
     given = config(tmp_path, train_calls="reasoning.*", lora_targets="q_proj")
     assert (given.train_calls, given.lora_targets) == (["reasoning.*"], ["q_proj"])

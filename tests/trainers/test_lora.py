@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,8 +10,13 @@ import torch
 
 pytest.importorskip("trl")
 
+from agentspec.registry import SpecError
+from tests.tiny import tiny_model, tiny_tokenizer
+from tests.trainers.builders import CPU_RUN
 from tests.trainers.test_frozen import upper_lora
+from trainers.config import ScaffoldConfig
 from trainers.lora import merged_lora
+from trainers.policy import _new_lora
 
 IDS = torch.arange(24).reshape(2, 12)
 
@@ -58,3 +64,13 @@ def test_what_is_not_plain_stays_with_peft() -> None:
         model.gradient_checkpointing_disable()
     with model.disable_adapter(), merged_lora(model):
         assert not any("forward" in vars(m) for m in model.modules() if hasattr(m, "lora_A"))
+
+
+def test_targets_that_the_model_lacks_are_named(tmp_path: Path) -> None:
+    model = tiny_model(tiny_tokenizer())
+    for targets, message in ((["q_projj"], "no module 'q_projj'; did you mean q_proj"), ([], "no module ''")):
+        config = ScaffoldConfig(output_dir=str(tmp_path), lora_targets=targets, **CPU_RUN)
+        with pytest.raises(SpecError, match=message):
+            _new_lora(model, config)
+    config = ScaffoldConfig(output_dir=str(tmp_path), lora_targets=["self_attn.q_proj"], **CPU_RUN)
+    assert _new_lora(model, config).target_modules == {"self_attn.q_proj"}

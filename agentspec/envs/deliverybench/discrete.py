@@ -55,7 +55,7 @@ class MenuActions(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take the choice of that number."""
         choices = self._choices
-        text = choices[int(action)] if int(action) < len(choices) else f"choice {int(action)} of {len(choices)}"
+        text = choices[int(action)] if 0 <= int(action) < len(choices) else f"choice {int(action)} of {len(choices)}"
         observation, reward, terminated, truncated, info = self.env.step(text)
         return observation, reward, terminated, truncated, self._masked(info)
 

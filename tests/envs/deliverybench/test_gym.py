@@ -185,3 +185,10 @@ def test_wrappers_say_what_they_need() -> None:
     with pytest.raises(ValueError, match="'native'; discrete actions need the menu"):
         make(action_mode="native")
     assert Numbers(MenuActions(tiny(action_mode="menu"))).reset(seed=0)[0].any()
+
+
+def test_a_number_below_zero_is_no_choice() -> None:
+    env = gymnasium.make("agentspec/DeliveryBenchDiscrete-v0", size="tiny", shift_hours=0.1, observation="compact")
+    before = env.reset(seed=0)[1]
+    _, reward, _, _, after = env.step(-1)
+    assert after["invalid"] and reward == 0.0 and after["state"]["clock_s"] == before["state"]["clock_s"]
