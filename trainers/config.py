@@ -149,7 +149,10 @@ class ScaffoldConfig(GRPOConfig):
             self.bf16 = False  # TRL's default would round log-probabilities to 16 bits, and is slower on a CPU
         if hasattr(self, CHECKPOINTING) and getattr(self, CHECKPOINTING) is None:
             setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
-        super().__post_init__()
+        try:
+            super().__post_init__()
+        except TypeError as error:  # a mapping of its own with a key that nobody knows (`accelerator_config`, say)
+            raise SpecError(f"configuration: {error}") from error
 
     @property
     def spec(self) -> AgentSpec:
