@@ -40,7 +40,9 @@ def replay(world: Thor, trial: Trial) -> tuple[Progress, int]:
 
 def main() -> None:
     """Replay and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("--data", type=Path, default=HOUSEHOLD / "alfred_json_2.1.0")
     parser.add_argument("--tables", type=Path, default=None)
     parser.add_argument("--objects", type=Path, default=HOUSEHOLD / "objects")

@@ -74,7 +74,9 @@ def means(episodes: list[dict[str, float]]) -> dict[str, float]:
 
 def main() -> None:
     """Play and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--world", choices=tuple(FIGURES), default=None)
     parser.add_argument("--draws", type=int, default=3)

@@ -14,6 +14,7 @@ from trl import GRPOConfig
 from agentspec.carry import start_bank
 from agentspec.llm.models import base_of
 from agentspec.parameters import check_types
+from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
 from trainers.ahead import OURS, check_world, structure
