@@ -152,7 +152,11 @@ class ScaffoldConfig(GRPOConfig):
             setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
         try:
             super().__post_init__()
-        except (AttributeError, TypeError) as error:  # a mapping of its own of another form (`accelerator_config`, say)
+        except (
+            AttributeError,
+            ImportError,
+            TypeError,
+        ) as error:  # a mapping of its own of another form (`accelerator_config`, say)
             raise SpecError(f"configuration: {error}") from error
 
     @property
