@@ -14,6 +14,7 @@ from trl import GRPOConfig
 from agentspec.carry import start_bank
 from agentspec.llm.models import base_of
 from agentspec.parameters import check_types
+from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
 from trainers.ahead import OURS, check_world, structure
@@ -149,7 +150,10 @@ class ScaffoldConfig(GRPOConfig):
             self.bf16 = False  # TRL's default would round log-probabilities to 16 bits, and is slower on a CPU
         if hasattr(self, CHECKPOINTING) and getattr(self, CHECKPOINTING) is None:
             setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
-        super().__post_init__()
+        try:
+            super().__post_init__()
+        except (TypeError, AttributeError) as error:  # a mapping that TRL hands on (`accelerator_config`, say)
+            raise SpecError(f"configuration: {error}") from error
 
     @property
     def spec(self) -> AgentSpec:
