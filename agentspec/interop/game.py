@@ -43,6 +43,7 @@ class Game:
         if not self.info:
             raise RuntimeError("act() before start(): there is no episode yet")
         if self.over:
+            self.reward = 0.0  # what the last step earned is paid once
             return OVER
         observation, reward, terminated, truncated, self.info = self._env.step(text)
         self.steps += 1

@@ -50,6 +50,15 @@ def test_an_action_that_fails_again_for_the_same_reason() -> None:
     assert not any("state_confusion" in leaf for leaf, _ in leaves(COURIER, wrong))
 
 
+@pytest.mark.parametrize("form", ["take {}", 'PICKUP("{}")'])
+def test_taking_what_the_task_does_not_name(form: str) -> None:
+    mode = {"action_mode": "menu" if form.startswith("take") else "native"}
+    wrong = ("grounding/object/misclassification", 0)
+    assert wrong in leaves(Task("alfred", 4, mode), form.format("mug 1"))  # it asks for a plate
+    assert wrong not in leaves(Task("alfred", 4, mode), form.format("plate 1"))
+    assert wrong not in leaves(Task("alfred", 9, mode), form.format("knife 1"))  # it asks for a slice
+
+
 def test_running_into_walls_and_in_circles() -> None:
     found = leaves(EMPTY, *["FORWARD()"] * 8)  # 6x6: three steps to the wall, then it is in the way
     assert {leaf for leaf, _ in found} == {"grounding/spatial/stuck"} and found[0][1] >= 4

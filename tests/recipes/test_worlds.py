@@ -94,7 +94,7 @@ def test_two_updates_of_a_world_s_configuration(
         per_device_train_batch_size="1",
         gradient_accumulation_steps="4",
         max_steps="2",
-        eval_tasks="0",
+        eval_tasks="1",
         lora_layers="0",
         plots="false",
     )

@@ -19,10 +19,10 @@ from typing import Any, ClassVar, Literal
 from agentspec.envs.alfred import menu
 from agentspec.envs.alfred.goals import Changes, Progress, progress
 from agentspec.envs.alfred.listing import in_view, worded
-from agentspec.envs.alfred.own import own_trial
+from agentspec.envs.alfred.own import TASKS, own_trial
 from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import PAPER, Trial, read_trial, trial_path
-from agentspec.envs.thor.game import Game, Told, check
+from agentspec.envs.thor.game import Game, Told, check, check_folders, check_index
 from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
 from agentspec.envs.thor.names import Names
@@ -47,12 +47,12 @@ class AlfredEnv(Game):
     Args:
         suite: `own` (our tasks; the seed picks one and its layout) or `paper` (the seven tasks, seed modulo seven;
             needs `data`).
-        task: index of a suite's task instead of the seed's; -1 for the seed's.
+        task: index of a suite's task (0 to 15 of `own`, 0 to 6 of `paper`) instead of the seed's; -1 for the seed's.
         trial: which of the three trials of a task of the paper (0 to 2).
         trial_file: path of any `traj_data.json`, instead of a suite.
         data: folder with ALFRED's json files (that has `valid_unseen`, or the trials in other folders below it).
         objects, layouts: folders with recorded object metadata and layouts; default: beside `data`.
-        annotation: which of the instructions people wrote.
+        annotation: which of the instructions people wrote, from 0.
         action_mode: `native` calls, or a `menu`.
         max_steps: primitive steps after which the episode is truncated.
         end_on_success: end when all goal conditions are met; else only `STOP()` ends.
@@ -106,8 +106,14 @@ class AlfredEnv(Game):
     ) -> None:
         check("suite", suite, ("own", "paper"))
         check("action_mode", action_mode, ("native", "menu"))
-        if (suite == "paper" or trial_file) and not data:
+        recorded = suite == "paper" or bool(trial_file)
+        if recorded and not data:
             raise ValueError("data is empty; give the folder with ALFRED's json files (that has valid_unseen)")
+        tasks = 1 if trial_file else len(PAPER if recorded else TASKS)
+        check_index("task", task, -1, tasks - 1 if tasks > 1 else -1)
+        check_index("trial", trial, 0, len(PAPER[0][1]) - 1 if recorded and not trial_file else 0)
+        check_index("annotation", annotation, 0, None if recorded else 0)
+        check_folders(recorded, data=data, objects=objects, layouts=layouts)
         self._objects = objects or str(Path(data).parent / "objects")
         self._layouts = layouts or str(Path(data).parent / "layouts")
         super().__init__(
@@ -170,11 +176,11 @@ class AlfredEnv(Game):
         self.progress: Progress = progress(self.trial.type, self.trial.targets, event.metadata, self.changes)
 
     def reachable(self, one: Mapping[str, Any]) -> bool:
-        """Whether there is a way to see an object; found once for where it is."""
-        at = one["position"]
+        """Whether there is a way to see an object; found once for where it is and what is around it."""
+        at, inside = one["position"], tuple(one["parentReceptacles"] or ())
         boxes = self.world.boxes()
-        shut = any(b.closed for b in boxes.state.bodies.values() if b.id in (one["parentReceptacles"] or ()))
-        key = (one["objectId"], at["x"], at["y"], at["z"], shut)
+        hidden = any(b.closed or b.held for b in boxes.state.bodies.values() if b.id in inside)
+        key = (one["objectId"], at["x"], at["y"], at["z"], inside, hidden)
         if key not in self._ways:
             self._ways[key] = way_to_see(boxes, boxes.state.bodies[one["objectId"]]) is not None
         return self._ways[key]

@@ -100,18 +100,20 @@ def read_trial(path: Path, annotation: int = 0) -> Trial:
 
     Raises:
         NoData: there is no such file.
-        ValueError: the file is no trial.
+        ValueError: the file is no trial, or has no such instruction.
     """
     data = read_json(path)
     try:
         scene, params = data["scene"], data["pddl_params"]
         words = data["turk_annotations"]["anns"]
         actions = tuple(step["api_action"] for step in data["plan"]["low_actions"])
+        if not 0 <= annotation < len(words):
+            raise ValueError(f"annotation is {annotation}; {path} has 0 to {len(words) - 1}")
         return Trial(
             id=data["task_id"],
             type=data["task_type"],
             scene=scene["floor_plan"],
-            instruction=words[annotation % len(words)]["task_desc"].strip(),
+            instruction=words[annotation]["task_desc"].strip(),
             targets=Targets(
                 params["object_target"],
                 params["parent_target"],
@@ -133,4 +135,4 @@ def read_trial(path: Path, annotation: int = 0) -> Trial:
 def trial_path(data: Path, task: int, trial: int) -> Path:
     """Where one of the paper's trials lies below `data` (the folder that has `valid_unseen`)."""
     folder, names = PAPER[task % len(PAPER)]
-    return data / "valid_unseen" / folder / names[trial % len(names)] / "traj_data.json"
+    return data / "valid_unseen" / folder / names[trial] / "traj_data.json"

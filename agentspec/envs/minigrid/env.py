@@ -24,7 +24,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
-from agentspec.envs.minigrid.search import ACTIONS, optimum
+from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum
 from agentspec.envs.minigrid.suites import Layout, layout_of
 from agentspec.envs.minigrid.texts import TEXTS, compact
 from agentspec.envs.minigrid.view import Thing, View, look
@@ -100,7 +100,9 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         "metrics": (
             Metric("success", summary="whether the mission was fulfilled (0 or 1)"),
             Metric("efficiency", summary="success * L* / max(steps, L*), L* the fewest actions that solve the layout"),
-            Metric("reward", summary="MiniGrid's own: 1 - 0.9 * steps / max_steps on success, else 0"),
+            Metric(
+                "reward", summary="MiniGrid's own: 1 - 0.9 * steps / max_steps on success, else 0 (-1: a collision)"
+            ),
         ),
         "typical_return": 1.0,
     }
@@ -135,7 +137,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         self.max_steps = max_steps
         self.images = images
         self.render_mode = render_mode
-        self.action_schema = _schema(menu=action_mode == "menu")
+        self.action_schema = _schema(menu=action_mode == "menu", count=actions_of(level) if level else len(ACTIONS))
         answer = "The actions are: " + ", ".join(self.action_schema.choices) if self.action_schema.choices else ""
         self.instruction = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
@@ -174,7 +176,11 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         """Carry out one action given as text; no text raises, a text that is no action takes a step.
 
         After the end nothing happens any more.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
         """
+        assert self.world is not None
         if self._ended:
             observation, info = self.observe()
             return observation, 0.0, self._terminated, self._truncated, info
@@ -235,6 +241,9 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
             state = json.loads(blob)
             version, layout, history = state["version"], Layout(**state["layout"]), [int(a) for a in state["history"]]
             last = _Last(**state["last"])
+            layout_of(level=layout.id)
+            if not all(NO_ACTION <= number < len(ACTIONS) for number in history):
+                raise ValueError(f"its history has numbers that are no actions: {history}")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"these bytes are no snapshot of a MiniGrid environment ({error!r})") from error
         if version != SNAPSHOT_VERSION:
@@ -333,11 +342,13 @@ class _Last:
     code: str = ""
 
 
-def _schema(*, menu: bool) -> ActionSchema:
-    actions = {name: ActionSpec(name, what, {}, f"{name}()") for name, (_, what) in CALLS.items()}
-    aliases = {**ALIASES, **{phrase.upper(): name for name, (phrase, _) in CALLS.items()}}
-    schema = ActionSchema(actions, aliases)
-    return replace(schema, choices=tuple(phrase for phrase, _ in CALLS.values())) if menu else schema
+def _schema(*, menu: bool, count: int) -> ActionSchema:
+    """The first `count` of MiniGrid's actions, as calls or as a menu."""
+    calls = dict(list(CALLS.items())[:count])
+    actions = {name: ActionSpec(name, what, {}, f"{name}()") for name, (_, what) in calls.items()}
+    aliases = {name: call for name, call in ALIASES.items() if call in calls}
+    schema = ActionSchema(actions, aliases | {phrase.upper(): name for name, (phrase, _) in calls.items()})
+    return replace(schema, choices=tuple(phrase for phrase, _ in calls.values())) if menu else schema
 
 
 def _number(name: str) -> int:

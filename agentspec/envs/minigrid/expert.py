@@ -30,14 +30,14 @@ class ShortestPlan:
         self._plan: list[int] = []
 
     def act(self, info: Mapping[str, Any]) -> str:
-        """The next action of a shortest plan; "done" where nothing leads to success any more."""
+        """The next action of a shortest plan; the last one ("done") where nothing leads to success any more."""
         state = info["state"]
         history = [int(a) for a in state["history"]]
         if history != self._done or not self._plan:
             self._plan = self._search(state["layout"], history)
-        action = self._plan.pop(0) if self._plan else len(CALLS) - 1
+        calls, phrases = info["action_schema"].actions, info["action_schema"].choices
+        action = self._plan.pop(0) if self._plan else len(calls) - 1
         self._done = [*history, action]
-        phrases = info["action_schema"].choices
         return phrases[action] if phrases else f"{list(CALLS)[action]}()"
 
     def _search(self, layout: Mapping[str, Any], history: list[int]) -> list[int]:
@@ -89,8 +89,8 @@ class Chance:
 
     def act(self, info: Mapping[str, Any]) -> str:
         """A random action."""
-        phrases = info["action_schema"].choices
-        return self._rng.choice(phrases or [f"{name}()" for name in CALLS])
+        schema = info["action_schema"]
+        return self._rng.choice(schema.choices or [f"{name}()" for name in schema.actions])
 
     def snapshot(self) -> bytes:
         """The generator's state."""

@@ -126,14 +126,32 @@ def shortest_plan(world: Any, *, most_states: int = 200_000) -> list[int] | None
         start()
 
 
+@functools.lru_cache(maxsize=256)
+def actions_of(id: str) -> int:
+    """How many of `ACTIONS` the registered environment `id` takes: Dynamic-Obstacles reads the others as turns."""
+    import minigrid  # noqa: F401  (registers its environments)
+
+    env = gymnasium.make(id, disable_env_checker=True)
+    try:
+        space: Any = env.action_space
+        return min(len(ACTIONS), int(space.n))
+    finally:
+        env.close()
+
+
 @functools.lru_cache(maxsize=4096)
 def optimum(id: str, seed: int, most_states: int = 200_000) -> int | None:
-    """Fewest actions that solve layout `seed` of the registered environment `id`, or `None` if none was found."""
+    """Fewest actions that solve layout `seed` of the registered environment `id`.
+
+    `None` if none was found, and where obstacles move by chance: a plan is then as short as luck has it.
+    """
     import minigrid  # noqa: F401  (registers its environments)
 
     env = gymnasium.make(id, disable_env_checker=True)
     try:
         env.reset(seed=seed)
+        if hasattr(env.unwrapped, "obstacles"):
+            return None
         plan = shortest_plan(env.unwrapped, most_states=most_states)
     finally:
         env.close()

@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Literal
 from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
 from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor import homes, mining
-from agentspec.envs.thor.game import Game, Told, check
+from agentspec.envs.thor.game import Game, Told, check, check_folders
 from agentspec.envs.thor.names import Names, direction, whereabouts, words
 from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Scene
@@ -105,6 +105,7 @@ class RoboThorEnv(Game):
         check("reward", reward, ("success", "progress"))
         if (suite == "validation" or episode) and not data:
             raise ValueError("data is empty; give the folder with the challenge's episode files (<scene>.json.gz)")
+        check_folders(suite == "validation" or bool(episode), data=data, objects=objects)
         if max_steps < 0:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1, or 0 for the preset's")
         self.preset = PRESETS[preset]

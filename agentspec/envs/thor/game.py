@@ -12,6 +12,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -21,6 +22,7 @@ from gymnasium import spaces
 
 from agentspec.actions import parse_action
 from agentspec.envs.thor.engine import OfflineThor, Settings
+from agentspec.envs.thor.mining import NoData
 from agentspec.envs.thor.protocol import Event, Thor
 from agentspec.envs.thor.scene import Scene
 from agentspec.types import Action, ActionError, ActionSchema
@@ -209,6 +211,7 @@ class Game(gymnasium.Env[dict[str, Any], str]):
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The egocentric picture, uint8 (H, W, 3), with `render_mode="rgb_array"`, else None."""
+        self._running()
         return self.world.observe().frame if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -251,7 +254,7 @@ class Game(gymnasium.Env[dict[str, Any], str]):
             self.steps, self.stopped, self.truncated = state["steps"], state["stopped"], state["truncated"]
             self.history, self.told = list(state["history"]), Told(**state["told"])
             self._recall(state["records"])
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError) as error:
             raise ValueError(f"these bytes are no snapshot of {type(self).__name__} ({error!r})") from error
         self._schema_now = self._schema()
 
@@ -268,3 +271,30 @@ def check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
     if value not in allowed:
         raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
+
+
+def check_index(name: str, value: int, least: int, most: int | None) -> None:
+    """Refuse a number out of its range; `most` None: no upper bound.
+
+    Raises:
+        ValueError: it is.
+    """
+    if value < least or (most is not None and value > most):
+        span = f"at least {least}" if most is None else f"{least} to {most}" if most > least else f"{least}"
+        raise ValueError(f"{name} is {value}; expected {span} with the other options as they are")
+
+
+def check_folders(used: bool, **folders: str) -> None:
+    """Refuse folders that are named and not there, or that nothing would be read from.
+
+    Raises:
+        NoData: there is no such folder.
+        ValueError: what is played reads no public data.
+    """
+    for name, folder in folders.items():
+        if folder and not used:
+            raise ValueError(
+                f"{name} is {folder!r}, but the suite `own` reads no data; leave it out, or choose another"
+            )
+        if folder and not Path(folder).is_dir():
+            raise NoData(f"{name} is {folder!r}: there is no such folder")

@@ -73,7 +73,9 @@ def _refused(trajectory: Trajectory) -> Iterator[Sign]:
 def _wrong_object(trajectory: Trajectory) -> Iterator[Sign]:
     """Picked up what the task does not speak of."""
     for t in trajectory.transitions:
-        picked = re.match(r'(?:PICKUP\("|pick up )([a-z ]+?)(?: \d+)?(?:"\)|$)', t.action_text)
+        picked = re.match(r'(?:PICKUP\("|take )([a-z ]+?)(?: \d+)?(?:"\)|$)', t.action_text)
+        if picked and picked[1].endswith("knife"):
+            continue  # what is to be sliced needs one, and tasks seldom say so
         wanted = str(t.input.state.get("task") or t.input.instruction).lower()
         if picked and not t.info.get("invalid") and picked[1] not in wanted and picked[1].split()[-1] not in wanted:
             yield Sign(

@@ -140,7 +140,10 @@ def settle(bodies: dict[str, Body]) -> None:
     for one in bodies.values():
         if "pickupable" not in one.abilities:
             continue
-        one.parents = [c.id for c in containers if c.id != one.id and contains(c, one)]
+        around = [c for c in containers if c.id != one.id and contains(c, one)]
+        if any(_lidded(c) for c in around):  # what is in a drawer is not on the desk that the drawer is in
+            around = [c for c in around if _lidded(c) or "pickupable" in c.abilities]
+        one.parents = [c.id for c in around]
 
 
 def contains(container: Body, one: Body) -> bool:
@@ -149,10 +152,13 @@ def contains(container: Body, one: Body) -> bool:
     x, z, bottom = one.centre[0], one.centre[2], one.low[1]
     if one.size[0] * one.size[2] > 1.5 * container.size[0] * container.size[2]:
         return False
-    lidded = "openable" in container.abilities and "pickupable" not in container.abilities
-    reach = -0.01 if lidded else 0.12  # what lies on a drawer is not in it
+    reach = -0.01 if _lidded(container) else 0.12  # what lies on a drawer is not in it
     inside = low[0] - 0.03 <= x <= high[0] + 0.03 and low[2] - 0.03 <= z <= high[2] + 0.03
     return inside and low[1] - 0.08 <= bottom <= high[1] + reach
+
+
+def _lidded(container: Body) -> bool:
+    return "openable" in container.abilities and "pickupable" not in container.abilities
 
 
 def place(scene: Scene) -> State:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import gymnasium
 import pytest
 
 from agentspec.envs import check_environment
@@ -106,3 +107,77 @@ def test_snapshots_are_identities_under_random_play():
 def test_data_must_be_named_for_the_paper_tasks():
     with pytest.raises(ValueError, match="data is empty"):
         AlfredEnv(suite="paper")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": 16}, "task is 16; expected -1 to 15"),
+        ({"task": -2}, "task is -2"),
+        ({"trial": 1}, "trial is 1; expected 0"),
+        ({"annotation": 1}, "annotation is 1; expected 0"),
+        ({"data": "."}, "the suite `own` reads no data"),
+        ({"suite": "paper", "data": "nowhere"}, "data is 'nowhere': there is no such folder"),
+        ({"suite": "paper", "data": ".", "objects": "nowhere"}, "objects is 'nowhere'"),
+        ({"suite": "paper", "data": ".", "task": 7}, "task is 7; expected -1 to 6"),
+        ({"suite": "paper", "data": ".", "trial": 3}, "trial is 3; expected 0 to 2"),
+        ({"suite": "paper", "data": ".", "trial": -3}, "trial is -3"),
+        ({"suite": "paper", "data": ".", "annotation": -1}, "annotation is -1; expected at least 0"),
+        ({"trial_file": "x.json", "data": ".", "task": 3}, "task is 3; expected -1"),
+    ],
+)
+def test_options_out_of_range_or_without_effect_are_refused(options, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        AlfredEnv(**options)
+
+
+@needs_data
+def test_an_instruction_that_nobody_wrote_is_refused():
+    with pytest.raises(ValueError, match=r"annotation is 77; .* has 0 to"):
+        AlfredEnv(suite="paper", data=TRIALS, annotation=77).reset(seed=0)
+
+
+def test_the_menu_does_not_depend_on_what_was_looked_up_before():
+    """What lies in a bowl can be gone to until the bowl is taken; a cache that forgets the hand kept the way."""
+    env, twin = AlfredEnv(action_mode="menu"), AlfredEnv(action_mode="menu")
+    env.reset(seed=2)
+    bodies = env.world.boxes().state.bodies
+    bowl, spoon = (next(b for b in bodies.values() if b.type == name) for name in ("Bowl", "Spoon"))
+    spoon.move(bowl.centre)
+    spoon.parents = [bowl.id, *bowl.parents]
+    env.world.boxes().touched()
+    env._look(env.world.observe())
+    env.known.add(spoon.id)
+    record = next(o for o in env.event.metadata["objects"] if o["objectId"] == spoon.id)
+    assert env.reachable(record)
+    bowl.held = True
+    bowl.parents, spoon.parents = [], [bowl.id]
+    env.world.boxes().touched()
+    env._look(env.world.observe())
+    twin.restore(env.snapshot())
+    assert env._schema().choices == twin.offered
+    assert f"go to {env.names.name(spoon.id)}" not in twin.offered
+
+
+def test_before_the_first_reset_it_is_said_that_there_is_no_episode():
+    env = AlfredEnv(render_mode="rgb_array")
+    for call in (env.observe, env.snapshot, env.render, lambda: env.step("STOP()")):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            call()
+
+
+@pytest.mark.parametrize("blob", [b"", b"[]", b"{}", b"\xff"])
+def test_bytes_that_are_no_snapshot_are_refused(blob):
+    env = AlfredEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="no snapshot of AlfredEnv"):
+        env.restore(blob)
+
+
+def test_what_is_in_a_drawer_is_not_on_the_counter_above():
+    env = AlfredEnv()
+    for seed in (35, 47):  # a tomato below the counter it should go to, a CD in a drawer of the desk
+        _, info = env.reset(seed=seed)
+        assert info["metrics"]["goal_conditions_met"] == 0
+    wanted = [o for o in env.event.metadata["objects"] if o["objectType"] == "CD"]
+    assert ["Drawer"] in [[p.split("|")[0] for p in o["parentReceptacles"] or ()] for o in wanted]

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import agentspec.envs  # noqa: F401  (registers)
 from agentspec.envs import check_environment
 from agentspec.envs.minigrid.env import CALLS, MiniGridEnv
+from agentspec.envs.minigrid.expert import expert
 from agentspec.envs.minigrid.search import shortest_plan
 from agentspec.envs.minigrid.suites import PAPER, SUITES
 from agentspec.types import Task
@@ -99,6 +100,34 @@ def test_bytes_that_are_no_snapshot_are_refused():
         env.restore(b"{}")
     with pytest.raises(ValueError, match="version 7"):
         env.restore(env.snapshot().replace(b'"version":1', b'"version":7'))
+    before = env.snapshot()
+    for old, new in ((b'"history":[]', b'"history":[77]'), (b'"history":[]', b'"history":[-5]'), (b"Empty", b"Void")):
+        with pytest.raises(ValueError, match="no snapshot of a MiniGrid environment"):
+            env.restore(before.replace(old, new))
+    assert env.snapshot() == before
+
+
+def test_before_the_first_reset_it_is_said_that_there_is_no_episode():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        MiniGridEnv().step("FORWARD()")
+
+
+@pytest.mark.parametrize("mode", ["native", "menu"])
+def test_a_level_with_fewer_actions_offers_no_others(mode):
+    """Dynamic-Obstacles knows three and turns left for any other; its obstacles move by chance: no L*."""
+    options = {"level": "MiniGrid-Dynamic-Obstacles-6x6-v0", "action_mode": mode}
+    env = MiniGridEnv(**options)
+    _, info = env.reset(seed=3)
+    assert list(info["action_schema"].actions) == ["TURN_LEFT", "TURN_RIGHT", "FORWARD"]
+    heading = info["state"]["heading"]
+    *_, info = env.step("pick up" if mode == "menu" else "PICK_UP()")
+    assert info["invalid"] and info["state"]["heading"] == heading
+    player, ended = expert(options, random.Random(0)), False
+    while not ended:
+        *_, terminated, truncated, info = env.step(player.act(info))
+        assert not info["invalid"]
+        ended = terminated or truncated
+    assert info["success"] and info["metrics"]["efficiency"] is None
 
 
 def test_pictures_are_first_person_and_whole():

@@ -121,3 +121,17 @@ def test_a_blocked_move_takes_a_step_and_is_told():
     _, _, _, _, info = env.step("move ahead")  # the sofa is less than 0.5 m ahead
     assert not info["invalid"] and "could not move ahead" in info["message"]
     assert info["metrics"]["path_length"] == 0.0 and info["state"]["steps_left"] == 199
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"data": "."}, "the suite `own` reads no data"),
+        ({"objects": "."}, "the suite `own` reads no data"),
+        ({"suite": "validation", "data": "nowhere"}, "data is 'nowhere': there is no such folder"),
+        ({"episode": "FloorPlan_Val1_1_Apple_0", "data": ".", "objects": "nowhere"}, "objects is 'nowhere'"),
+    ],
+)
+def test_folders_that_are_not_there_or_not_read_are_refused(options, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        RoboThorEnv(**options)

@@ -28,7 +28,7 @@ def connect() -> Wire:
 
 def main(arguments: Sequence[str]) -> None:
     """Play until nobody asks any more."""
-    parser = argparse.ArgumentParser(prog="agentspec.envs.thor.standin", description=__doc__)
+    parser = argparse.ArgumentParser(prog="agentspec.envs.thor.standin", description=__doc__, allow_abbrev=False)
     for name in FOLDERS:
         parser.add_argument(f"--{name}", default="")
     parser.add_argument("-screen-width", type=int, default=300)
