@@ -47,10 +47,9 @@ NAMES: dict[str, Collection[str]] = {
 RANGES: dict[tuple[float, float], str] = {
     (0, 1): "gamma top_entropy_quantile",
     (0, math.inf): "gigpo_weight epsilon epsilon_high beta learning_rate actor_temperature tokens_per_forward "
-    "rollout_concurrency retries lora_r lora_layers lora_alpha",
+    "rollout_concurrency retries lora_r lora_layers lora_alpha eval_tasks",
     (0.001, math.inf): "env_timeout_s",
-    (1, math.inf): "max_completion_length num_iterations train_tasks eval_tasks validation_tasks write_rerolls "
-    "write_points",
+    (1, math.inf): "max_completion_length num_iterations train_tasks validation_tasks write_rerolls write_points",
 }
 """Smallest and largest value that means something -> fields; others would turn a sign around, or be passed over."""
 

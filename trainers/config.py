@@ -152,11 +152,7 @@ class ScaffoldConfig(GRPOConfig):
             setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
         try:
             super().__post_init__()
-        except (
-            AttributeError,
-            ImportError,
-            TypeError,
-        ) as error:  # a mapping of its own of another form (`accelerator_config`, say)
+        except (TypeError, AttributeError, ImportError) as error:  # of a mapping that TRL hands on: `deepspeed`, say
             raise SpecError(f"configuration: {error}") from error
 
     @property

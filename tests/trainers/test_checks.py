@@ -71,7 +71,7 @@ def expected_errors_only(what: str) -> Iterator[None]:
         ({"eval_specs": {"reasoning": "direct"}}, "eval_specs must be a list or a text or null"),
         ({"eval_specs": [{"reasoning": "directt"}]}, "unknown reasoning 'directt'; did you mean direct"),
         ({"eval_sampling": {"temperatur": 0.0}}, "unknown key 'temperatur' in sampling; did you mean temperature"),
-        ({"eval_tasks": 0}, "eval_tasks is 0; expected a number of at least 1"),
+        ({"eval_tasks": -1}, "eval_tasks is -1; expected a number of at least 0"),
         ({"train_calls": []}, "train_calls is empty, so nothing would be trained"),
         ({"train_credits": []}, "train_credits is empty, so nothing would be trained"),
     ],
