@@ -27,7 +27,7 @@ def import_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name)):
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             raise SpecError(
                 f"no module {name!r} to import; give a module that Python finds from here, or the path of a .py file"
             ) from error

@@ -99,7 +99,12 @@ def test_modules_are_brought_in_by_file_and_by_name(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize(
     ("source", "message"),
-    [(None, "no module 'brought_in' to import"), ("1 / 0", "ZeroDivisionError"), ("import nope_nope", "nope_nope")],
+    [
+        (None, "no module 'brought_in' to import"),
+        ("1 / 0", "ZeroDivisionError"),
+        ("import nope_nope", "nope_nope"),
+        ("import brought", "failed: ModuleNotFoundError: No module named 'brought'"),  # how its own name begins
+    ],
 )
 def test_what_cannot_be_imported_says_why(tmp_path: Path, monkeypatch, source: str | None, message: str) -> None:
     monkeypatch.chdir(tmp_path)
