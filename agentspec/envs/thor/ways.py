@@ -28,7 +28,7 @@ def stand(world: OfflineThor) -> Stand:
     return x, z, round(agent.yaw / 90) % 4
 
 
-def reach(world: OfflineThor, start: Stand, stride: int = 1) -> Iterator[tuple[Stand, dict[Stand, tuple[Stand, str]]]]:
+def reach(world: OfflineThor, start: Stand) -> Iterator[tuple[Stand, dict[Stand, tuple[Stand, str]]]]:
     """The stands in the order of the primitives they take, each with the predecessors found so far."""
     cells = world.scene.cells
     before: dict[Stand, tuple[Stand, str]] = {}
@@ -39,8 +39,7 @@ def reach(world: OfflineThor, start: Stand, stride: int = 1) -> Iterator[tuple[S
         yield now, before
         x, z, heading = now
         dx, dz = AHEAD[heading]
-        free = all((x + dx * i, z + dz * i) in cells for i in range(1, stride + 1))
-        options = [((x + dx * stride, z + dz * stride, heading), "MoveAhead")] if free else []
+        options = [((x + dx, z + dz, heading), "MoveAhead")] if (x + dx, z + dz) in cells else []
         options += [((x, z, (heading + 1) % 4), "RotateRight"), ((x, z, (heading - 1) % 4), "RotateLeft")]
         for near, name in options:
             if near not in seen:
