@@ -1,4 +1,4 @@
-"""The command line: `agentspec run | eval | train | export | audit | list | view`.
+"""The command line: `agentspec run | eval | train | report | compare | export | audit | list | view`.
 
 Thin: every command parses its arguments, calls the library and prints. Input that cannot work is one line on stderr
 that names the remedy, and exit code 2; an episode that failed while running is exit code 1; anything unexpected keeps
