@@ -41,6 +41,10 @@ EXTRAS = {
     "statsmodels": "eval",
     "httpx": "openai",
     "minigrid": "minigrid",
+    "openenv": "openenv",
+    "uvicorn": "openenv",
+    "verifiers": "verifiers",
+    "filelock": "eval",
     "tensorboard": "tensorboard",
     "wandb": "wandb",
 }
