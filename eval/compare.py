@@ -22,7 +22,7 @@ from eval.inspect_logs import advantages_of, pictures_of
 from eval.report import figures
 from eval.report.blocks import STYLE
 
-GAUGES = ("balance", "net_earnings", "battery", "energy", "goal_conditions", "distance_left")
+GAUGES = ("balance", "battery", "energy", "goal_conditions", "distance_left")
 """Figures of a step that are drawn over its number, where a world reports them."""
 
 CSS = """

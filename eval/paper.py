@@ -22,6 +22,8 @@ import numpy as np
 FILE = Path(__file__).with_name("data") / "paper.csv"
 SOURCE = "AgentSpec paper, tables and plots as printed; read off by hand"
 COLUMNS = ("table", "environment", "backbone", "reasoning", "memory", "reflection", "policy", "metric", "value", "note")
+PROFIT = "hourly_profit"
+"""The paper's own name of its figure; as a word of the paper it may stand here."""
 CONFIGURATION = ("environment", "backbone", "reasoning", "memory", "reflection", "policy", "metric")
 
 Scaffold = tuple[str, str, str]
@@ -70,7 +72,12 @@ def table(name: str, metric: str = "", policy: str = "") -> dict[tuple[str, Scaf
     return {(n.backbone, n.scaffold): n.value for n in chosen}
 
 
-def printed_alike(metric: str = "hourly_profit", least: int = 5) -> list[tuple[str, str, int]]:
+def metric_of(world: str) -> str:
+    """What the paper's result tables print for a world, by the paper's name."""
+    return PROFIT if world == "deliverybench" else "success_rate"
+
+
+def printed_alike(metric: str = PROFIT, least: int = 5) -> list[tuple[str, str, int]]:
     """Pairs of tables that print the same values for different backbones: (table, table, number of values)."""
     tables = {
         name: {n.scaffold: n.value for n in numbers() if n.table == name and n.metric == metric}

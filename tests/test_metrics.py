@@ -137,6 +137,7 @@ def test_no_figure_of_an_environment_is_named_outside_it() -> None:
         f"{path.relative_to(root)}: {name}"
         for path in files
         if path.relative_to(root).parts[:2] != ("agentspec", "envs")
+        and path.relative_to(root).as_posix() != "eval/paper.py"  # the paper's tables have names of their own
         for name in ours
         if re.search(rf"\b{name}\b", path.read_text())
     }

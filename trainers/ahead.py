@@ -62,7 +62,7 @@ def check_ahead(data: Mapping[str, Any], options: Sequence[str]) -> None:
     for name in SPECS:
         value = fields.get(name)
         for spec in value if isinstance(value, list) else [value] if value else []:
-            AgentSpec.from_yaml(spec) if isinstance(spec, str) else AgentSpec.from_data(spec)
+            AgentSpec.from_yaml(spec) if isinstance(spec, str) else AgentSpec.from_data(_with_scope(spec))
     check_world(fields.get("environment") or "deliverybench")
     RewardSet(fields.get("rewards"))
     for name, known in (("estimator", estimator), ("loss_type", loss)):
@@ -70,6 +70,13 @@ def check_ahead(data: Mapping[str, Any], options: Sequence[str]) -> None:
             known(fields[name])
     if isinstance(fields.get("model"), str):
         check_name(fields["model"])
+
+
+def _with_scope(spec: Any) -> Any:
+    """A spec with the scope that a trained reflector gets from its recipe, where it gives none."""
+    reflection = spec.get("reflection") if isinstance(spec, Mapping) else None
+    name = reflection.get("name") if isinstance(reflection, Mapping) else reflection
+    return {"scope": "run", **spec} if name == "retroformer" else spec
 
 
 def structure(value: Any) -> Any:

@@ -120,7 +120,7 @@ def paper_section(rows: Sequence[Row]) -> list[Block]:
 
 
 def _beside(world: str, rows: Sequence[Row]) -> list[list[str]]:
-    wanted = "hourly_profit" if world == "deliverybench" else "success_rate"
+    wanted = paper.metric_of(world)
     metric = primary_metric(rows)
     agents = {(row["policy"], row["scaffold"]): row["agent"] for row in rows if row.get("agent")}
     body = []

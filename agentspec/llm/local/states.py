@@ -1,6 +1,6 @@
 """What went into one layer for every token that calls have read: kept for whoever would compute it again.
 
-A trainer whose lower layers are frozen starts its updates there (`trainers.frozen`). Like keys and values, a token's
+A trainer whose lower layers are frozen starts its updates there. Like keys and values, a token's
 states depend on the tokens before it only: pieces of them stand with a `Slot` and go where its positions go; when a
 call ends, they are found by its tokens.
 """
