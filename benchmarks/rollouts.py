@@ -57,7 +57,9 @@ def agent_spec() -> Any:
     """A plain agent: one call per step, an append-only conversation."""
     from agentspec.spec import AgentSpec
 
-    return AgentSpec.from_data({"reasoning": "direct", "layout": "conversation", "sampling": {"temperature": 1.0}})
+    # Answers of a fixed length are no actions: they are not asked for again.
+    reasoning = {"name": "direct", "max_retries": 0}
+    return AgentSpec.from_data({"reasoning": reasoning, "layout": "conversation", "sampling": {"temperature": 1.0}})
 
 
 def market_tasks(rollouts: int, options: dict[str, Any]) -> list[tuple[Any, int]]:
