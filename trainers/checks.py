@@ -164,7 +164,7 @@ def _writes(config: ScaffoldConfig) -> Iterator[str]:
 
 
 def _rounds(config: ScaffoldConfig) -> Iterator[str]:
-    """An update reads one generation round, whole or in equal parts; it is weighed as told; the best one is kept."""
+    """An update reads one generation round, whole or in equal parts; rewards as configured; the best one kept."""
     accumulated, made = config.gradient_accumulation_steps, config.steps_per_generation
     rollouts, group = config.generation_batch_size or 0, config.num_generations
     if made % accumulated:

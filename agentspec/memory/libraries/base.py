@@ -138,7 +138,7 @@ class LibraryMemory(ABC):
     # -- the protocol ------------------------------------------------------------------------------------------------
 
     @cached_property
-    def library(self) -> Any:
+    def client(self) -> Any:
         """The library's memory."""
         telemetry_off()
         return self.open()
@@ -197,7 +197,7 @@ class LibraryMemory(ABC):
 
     def restore(self, blob: bytes) -> None:
         entries, waiting, lines, self._failures, self._last_error = load_state(blob)
-        self.__dict__.pop("library", None)
+        self.__dict__.pop("client", None)
         self.load(entries)
         self._pending = [Step.load(state) for state in waiting]
         self._lines = deque(lines, maxlen=self._lines.maxlen)

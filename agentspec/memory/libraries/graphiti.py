@@ -80,15 +80,15 @@ class GraphitiLibrary(LibraryMemory):
         return Graph(self.asker, embedder_of(self.services))
 
     async def add(self, steps: Sequence[Step]) -> None:
-        await self.library.add("\n\n".join(step.text for step in steps), steps[-1].time.total)
+        await self.client.add("\n\n".join(step.text for step in steps), steps[-1].time.total)
 
     async def search(self, text: str, k: int) -> list[tuple[str, float]]:
-        found: list[tuple[str, float]] = await self.library.search(text, k)
+        found: list[tuple[str, float]] = await self.client.search(text, k)
         return found
 
     def export(self) -> list[Any]:
-        entries: list[Any] = self.library.export()
+        entries: list[Any] = self.client.export()
         return entries
 
     def load(self, entries: Sequence[Any]) -> None:
-        self.library.load(entries)
+        self.client.load(entries)

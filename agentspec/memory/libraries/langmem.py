@@ -69,15 +69,15 @@ class LangMemLibrary(LibraryMemory):
         return Store(self.asker, embedder_of(self.services), self.similar, self.instructions)
 
     async def add(self, steps: Sequence[Step]) -> None:
-        await self.library.manage([step.text for step in steps])
+        await self.client.manage([step.text for step in steps])
 
     async def search(self, text: str, k: int) -> list[tuple[str, float]]:
-        found: list[tuple[str, float]] = await self.library.search(text, k)
+        found: list[tuple[str, float]] = await self.client.search(text, k)
         return found
 
     def export(self) -> list[Any]:
-        entries: list[Any] = self.library.items()
+        entries: list[Any] = self.client.items()
         return entries
 
     def load(self, entries: Sequence[Any]) -> None:
-        self.library.put(entries)
+        self.client.put(entries)

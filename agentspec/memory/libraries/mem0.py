@@ -86,20 +86,20 @@ class Mem0Library(LibraryMemory):
 
     async def add(self, steps: Sequence[Step]) -> None:
         messages = [{"role": "user", "content": step.text} for step in steps]
-        memory = self.library
+        memory = self.client
         await self.bridge.run(lambda: memory.add(messages, user_id=WHO))
 
     async def search(self, text: str, k: int) -> list[tuple[str, float]]:
-        memory = self.library
+        memory = self.client
         found = await self.bridge.run(lambda: memory.search(text, user_id=WHO, limit=k))
         return [(item["memory"], float(item["score"])) for item in found["results"]]
 
     def export(self) -> list[Any]:
-        points, _ = self.library.vector_store.list(limit=ALL)
+        points, _ = self.client.vector_store.list(limit=ALL)
         return sorted([[str(p.id), p.payload] for p in points], key=lambda e: (e[1].get("created_at", ""), e[0]))
 
     def load(self, entries: Sequence[Any]) -> None:
-        memory = self.library
+        memory = self.client
         for key, payload in entries:
             vector = memory.embedding_model.embed(payload["data"], "add")
             memory.vector_store.insert([vector], [payload], [key])
