@@ -1,7 +1,8 @@
 """What to play: tasks by split, and labelled sets of them.
 
-Shared by training, evaluation and the command line. Splits are ranges of seeds: where every seed starts another episode,
-a policy is never tested on what it was trained on. A finite suite repeats its episodes, and keeps nothing apart.
+Shared by training, evaluation and the command line. Splits are ranges of seeds: where every seed starts another
+episode, a policy is never tested on what it was trained on. A finite suite repeats its episodes, and keeps nothing
+apart.
 """
 
 from __future__ import annotations
