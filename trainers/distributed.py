@@ -8,6 +8,9 @@ fail but wait for ever, and is refused at start.
 
 from __future__ import annotations
 
+import atexit
+import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -119,9 +122,15 @@ def _unusable(call: LLMCall) -> str:
 
 
 def leave_group() -> None:
-    """Leave the process group, if this process is in one; the last thing a script does.
+    """Leave the process group, if this process is in one, and end the process: the last thing a script does.
 
-    Threads of a group that is still open when the interpreter ends can abort it, and the launcher calls that a failure.
+    A thread of the group that lets go of a Python object while the interpreter is taken apart aborts the process
+    ("terminate called without an active exception"), and the launcher calls that a failure. So what is registered to
+    run at the end runs, what was printed is written, and the interpreter is left as it is.
     """
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
