@@ -280,10 +280,8 @@ def notes(config: ScaffoldConfig) -> Iterator[str]:
 def _seen(config: ScaffoldConfig) -> Iterator[str]:
     """Held-out tasks that are training tasks all the same, in suites of few episodes."""
     trained = {episode_key(task) for task in make_tasks(*config.world, config.train_tasks)}
-    for split, count in (
-        ("validation", config.validation_tasks if config.validates else 0),
-        ("test", config.eval_tasks),
-    ):
+    validated = config.validation_tasks if config.validates else 0
+    for split, count in (("validation", validated), ("test", config.eval_tasks)):
         tasks = make_tasks(*config.world, count, split=split)
         if seen := sum(episode_key(task) in trained for task in tasks):
-            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: the suite has no others"
+            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: there are no others"

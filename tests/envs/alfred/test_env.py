@@ -190,7 +190,7 @@ def test_what_is_in_a_drawer_is_not_on_the_counter_above():
         ({"task": 1}, 1),
         ({"suite": "paper"}, 7),
         ({"suite": "paper", "task": 2}, 1),
-        ({"trial_file": "x"}, 1),
+        ({"trial_file": ""}, None),
     ],
 )
 def test_how_many_episodes_there_are(options, count):

@@ -122,5 +122,5 @@ def test_the_expert_of_practice_looks_before_it_chooses():
 def test_how_many_episodes_there_are(options: dict[str, str], count: int | None) -> None:
     """What the environment declares is what its seeds do."""
     assert MiniGridEnv.episodes(options) == count
-    layouts = {layout_of(**({"suite": "paper"} if not options else options), seed=seed) for seed in range(40)}
+    layouts = {layout_of(**(options or {"suite": "paper"}), seed=seed) for seed in range(40)}
     assert len(layouts) == (count or 40)
