@@ -174,7 +174,7 @@ def _tasks(label: str, item: Any) -> list[Task]:
     if episodes < len(tasks):
         raise SpecError(
             f"tasks {label!r}: {len(tasks)} seeds start {episodes} different episodes (this suite has no more), and "
-            f"one episode played twice is no second task: give {episodes} consecutive seeds; `rollouts` plays them again"
+            f"one episode played twice is not two tasks: give {episodes} seeds in a row; `rollouts` plays them again"
         )
     return tasks
 
