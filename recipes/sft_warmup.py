@@ -1,12 +1,13 @@
-"""A supervised warm start from a world's scripted expert, in the prompt layout that GRPO will use.
+"""A supervised warm start from a world's scripted expert, in the scaffolds that GRPO will use.
 
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_cpu.yaml
     accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_minigrid.yaml
+    accelerate launch recipes/sft_warmup.py --config recipes/configs/warmup_mixture_minigrid.yaml
     accelerate launch recipes/sft_warmup.py --environment '{"name": "alfred", "options": {"action_mode": "menu"}}'
 
 Any environment with an expert will do (`agentspec.envs.experts`). The first two made the adapters that ship
-(`agentspec/llm/shipped`). TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are
-context.
+(`agentspec/llm/shipped`). With `scaffolds` the expert plays through all of them (`agentspec.mixture`), and one adapter
+learns to act in each. TRL's `SFTTrainer` trains on the tokens the expert chose; prompts and observations are context.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def train_warmup(config: Any) -> None:
 
     name, options = config.world
     model, tokenizer = load_policy(config)
-    shown = demonstrate(config.spec, tokenizer, make_tasks(name, options, config.train_tasks))
+    tasks = make_tasks(name, options, config.train_tasks)
+    shown = demonstrate(config.mixture, tokenizer, tasks, config.train_filter, config.seed)
     returns = [float(t.metrics["return"]) for t in shown.episodes]
     print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(shown.rows)} rows")
     same = (

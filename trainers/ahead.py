@@ -21,7 +21,7 @@ from trainers.losses import loss
 
 OURS = {
     "model": "model adapter actor_adapter actor_temperature lora_r lora_alpha lora_targets lora_layers",
-    "agent and world": "agent environment train_tasks memory_carry start_memory retries env_timeout_s "
+    "agent and world": "agent environment scaffolds held_out train_tasks memory_carry start_memory retries env_timeout_s "
     "rollout_concurrency batching",
     "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
     "write_credit write_calls write_rerolls write_points "
@@ -35,7 +35,7 @@ KNOWN = frozenset(" ".join((*OURS.values(), *USED.values(), *FIXED, *REFUSED.val
 """Every field there is, ours and TRL's (a test compares it with the installed TRL)."""
 
 SPECS = ("agent", "eval_specs", "validation_specs")
-STRUCTURES = (*SPECS, "environment", "rewards")
+STRUCTURES = (*SPECS, "environment", "scaffolds", "held_out", "rewards", "eval_sampling")
 """Fields that hold a mapping or a list: on the command line as JSON or YAML."""
 
 

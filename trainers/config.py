@@ -13,11 +13,12 @@ from trl import GRPOConfig
 
 from agentspec.carry import start_bank
 from agentspec.llm.models import base_of
+from agentspec.mixture import mixture
 from agentspec.parameters import check_types
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
-from trainers.ahead import OURS, check_world, structure
+from trainers.ahead import OURS, STRUCTURES, check_world, structure
 from trainers.checks import check
 from trainers.credit import CreditRule
 from trainers.fields import USED
@@ -43,6 +44,10 @@ class ScaffoldConfig(GRPOConfig):
         actor_temperature: training a reflector: sampling temperature of the actor; lessons have the agent's.
         agent: the agent spec: a mapping, or a path to a YAML file.
         environment: `{name: ..., options: {...}}`: the world and its `gymnasium.make` arguments.
+        scaffolds: several agents instead of one: entries over `agent`, with lists of alternatives
+            (`agentspec.mixture`). A warm start plays its expert through all of them; in training the rollouts of each
+            group are dealt out over them.
+        held_out: agents that must not be among `scaffolds`, by what they name.
         train_tasks: number of distinct training tasks (seeds `0 .. train_tasks - 1`).
         eval_tasks: number of held-out tasks (seeds `20000 ..`) for evaluation after training.
         train_calls: patterns over `module/purpose` of the calls that are trained.
@@ -98,6 +103,8 @@ class ScaffoldConfig(GRPOConfig):
     actor_temperature: float = 0.0
     agent: dict[str, Any] | str | None = None
     environment: dict[str, Any] | str | None = None
+    scaffolds: list[Any] | str | None = None
+    held_out: list[Any] | str | None = None
     train_tasks: int = 64
     eval_tasks: int = 16
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])
@@ -138,7 +145,7 @@ class ScaffoldConfig(GRPOConfig):
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("agent", "environment", "rewards", "eval_specs", "validation_specs", "eval_sampling"):
+        for name in STRUCTURES:
             setattr(self, name, structure(getattr(self, name)))
         for name in LISTS:
             setattr(self, name, [given] if isinstance(given := getattr(self, name), str) else given)
@@ -159,6 +166,11 @@ class ScaffoldConfig(GRPOConfig):
     def spec(self) -> AgentSpec:
         """The training scaffold."""
         return agent_spec(self.agent).with_base(base_of(self.model))
+
+    @property
+    def mixture(self) -> list[AgentSpec]:
+        """The training scaffolds: `spec`, or those of `scaffolds`."""
+        return mixture(self.spec.to_data(), self.scaffolds, self.held_out)
 
     @property
     def credit_rule(self) -> CreditRule:

@@ -1,4 +1,4 @@
-"""Expert episodes -> a supervised warm start, in the layout that the policy will meet.
+"""Expert episodes -> a supervised warm start, in the scaffolds that the policy will meet.
 
 Few tokens of a row are the expert's: a dozen short actions among thousands of tokens of prompts and observations. So
 TRL's `SFTTrainer` gets its loss from the packed forward, which computes logits only where a token is trained.
@@ -6,18 +6,17 @@ TRL's `SFTTrainer` gets its loss from the packed forward, which computes logits 
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import nn
 from trl import SFTTrainer
 
-from agentspec.episode import Job, MakeEnv, Runner, make_env
-from agentspec.llm.demonstration import DemonstrationLLM
-from agentspec.registry import SpecError
-from agentspec.spec import AgentSpec, ModuleSpec
+from agentspec.demonstration import play_expert
+from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from trainers.forward import rows_logprobs
@@ -34,33 +33,23 @@ class Demonstrations:
 
 
 def demonstrate(
-    spec: AgentSpec,
-    tokenizer: Any,
-    tasks: Sequence[Task],
-    *,
-    expert: str = "rule_based",
-    make_env: MakeEnv = make_env,
+    specs: Sequence[AgentSpec], tokenizer: Any, tasks: Sequence[Task], train: TrainFilter, seed: int = 0
 ) -> Demonstrations:
-    """Play `tasks` with the expert, then again inside `spec` with the expert's actions as answers.
+    """The expert's episodes inside the scaffolds `specs`, each of which plays its share of the tasks.
 
-    The second pass writes the prompts of the scaffold; the environment is deterministic, so both passes agree.
+    Of every `len(specs)` tasks in a row each scaffold plays one, drawn by `seed`: none gets the same level each time.
 
     Raises:
-        SpecError: an episode failed, or the scaffold does not make one acting call per step.
+        SpecError: an episode failed, or a scaffold asks what the expert cannot answer.
     """
-    jobs = [Job(task) for task in tasks]
-    scripted = replace(spec, reasoning=ModuleSpec(expert), memory=ModuleSpec("none"), reflection=ModuleSpec("none"))
-    played = Runner(scripted, make_env=make_env).run(jobs)
-    actions = {episode.episode: [t.action_text for t in episode.transitions] for episode in played}
-    episodes = Runner(spec, DemonstrationLLM(tokenizer, actions), make_env=make_env).run(jobs)
-    failed = [t.error for t in (*played, *episodes) if not t.scorable]
-    if failed:
-        raise SpecError(f"{len(failed)} of {2 * len(jobs)} demonstration episodes failed, the first with: {failed[0]}")
-    rows = [
-        {"input_ids": s.tokens, "assistant_masks": [int(c >= 0) for c in s.calls]}
-        for episode in episodes
-        for s in build_sequences(episode, TrainFilter())
-    ]
+    rng, shares = random.Random(seed), [list[Task]() for _ in specs]
+    for start in range(0, len(tasks), len(specs)):
+        places = rng.sample(range(len(specs)), len(specs))
+        for place, task in zip(places, tasks[start : start + len(specs)], strict=False):
+            shares[place].append(task)
+    episodes = [e for spec, share in zip(specs, shares, strict=True) for e in play_expert(spec, tokenizer, share)]
+    sequences = (s for episode in episodes for s in build_sequences(episode, train))
+    rows = [{"input_ids": s.tokens, "assistant_masks": [int(c >= 0) for c in s.calls]} for s in sequences]
     return Demonstrations(rows, episodes)
 
 

@@ -1,13 +1,14 @@
 """A backend that answers with an expert's actions: demonstrations in exactly the tokens a policy would have sampled.
 
 The scaffold asks, the expert's recorded action of that episode and step is the answer, encoded and constrained as the
-local backend would encode it. So an ordinary run of any one-call scaffold becomes a set of training rows for a
-supervised warm start, in the layout that reinforcement learning will use afterwards.
+local backend would encode it. So an ordinary run of a scaffold becomes a set of training rows for a supervised warm
+start, in the layout that reinforcement learning will use afterwards. What is asked besides actions is answered by
+`write`, where somebody can (`agentspec.demonstration`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from agentspec.llm.base import LLMError, Message, Request
@@ -23,6 +24,9 @@ class DemonstrationLLM:
         tokenizer: the policy's tokenizer.
         actions: episode id -> the expert's action texts in order.
         max_context: longest prompt and answer.
+
+    Attributes:
+        write: answers the calls that ask for no action, or raises `LLMError`; `None`: all of them are refused.
     """
 
     capabilities = frozenset({"token_ids", "logprobs", "choices"})
@@ -32,21 +36,25 @@ class DemonstrationLLM:
         self.max_context = max_context
         self._format = chat_format(tokenizer)
         self._actions = actions
+        self.write: Callable[[Request], str] | None = None
 
     async def generate(self, request: Request) -> LLMCall:
-        """The expert's action of the request's episode and step, with log-probability 0.
+        """The expert's answer at the request's episode and step, with log-probability 0.
 
         Raises:
             LLMError: the expert has no action for this step, or it is not among the choices.
         """
         tag, choices = request.tag, request.sampling.choices
         known = self._actions.get(tag.episode, ())
-        if tag.purpose != "act" or not 0 <= tag.step < len(known):
+        if tag.purpose != "act" and self.write is not None:
+            text = self.write(request)
+        elif tag.purpose != "act" or not 0 <= tag.step < len(known):
             raise LLMError(
                 f"no demonstration for {tag.path} at step {tag.step} of episode {tag.episode}: it has {len(known)} "
                 "actions; demonstrate inside a scaffold that makes one acting call per step (reasoning direct)"
             )
-        text = known[tag.step]
+        else:
+            text = known[tag.step]
         if choices and text not in choices:
             raise LLMError(f"the expert's action {text!r} is not among the choices {list(choices)}")
         end = self._format.end_of_turn

@@ -89,6 +89,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         "typical_return": 50.0,
     }
     failure_signs: ClassVar[str] = "agentspec.envs.deliverybench.signs:signs"
+    expert_notes: ClassVar[str] = "agentspec.envs.deliverybench.notes:notes"
     experts: ClassVar[dict[str, str]] = {
         "rule_based": "agentspec.envs.deliverybench.expert.scripted:expert",
         "random": "agentspec.envs.deliverybench.expert.scripted:luck",

@@ -107,6 +107,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         "typical_return": 1.0,
     }
     failure_signs: ClassVar[str] = "agentspec.envs.minigrid.signs:signs"
+    expert_notes: ClassVar[str] = "agentspec.envs.minigrid.notes:notes"
     experts: ClassVar[dict[str, str]] = {
         "rule_based": "agentspec.envs.minigrid.expert:expert",
         "random": "agentspec.envs.minigrid.expert:luck",

@@ -2,8 +2,9 @@
 
 The expert sees the whole grid: it sets up the layout that `info["state"]` names, plays the actions so far, and searches
 from there. It is the upper reference for success and efficiency, and the demonstrator of warm starts; a player that has
-to find its way cannot always be as short. In the suite `practice` it first turns to what a player must have seen in
-order to choose (the object of Memory's start room): to copy a player that just knows would be to learn guessing.
+to find its way cannot always be as short. In the suite `practice`, and where `level` names a Memory level, it first
+turns to what a player must have seen in order to choose (the object of the start room): to copy a player that just
+knows would be to learn guessing.
 """
 
 from __future__ import annotations
@@ -106,8 +107,9 @@ class Chance:
 def expert(
     options: Mapping[str, Any], rng: random.Random, most_states: int = 200_000, look: bool | None = None
 ) -> ShortestPlan:
-    """The player `rule_based`; `most_states` bounds each search, `look` is on in the suite `practice`."""
-    return ShortestPlan(most_states, options.get("suite") == "practice" if look is None else look)
+    """The player `rule_based`; `most_states` bounds each search, `look` is on in `practice` and in a Memory `level`."""
+    looks = options.get("suite") == "practice" or "-Memory" in str(options.get("level", ""))
+    return ShortestPlan(most_states, looks if look is None else look)
 
 
 def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
