@@ -1,190 +1,190 @@
-"""Does it learn? Train each recipe with several seeds, then play held-out tasks before and after, under every scaffold.
+"""Does it learn, and where? Train arms in their scaffolds with several seeds, then play all policies in all scaffolds.
 
-    python -m recipes.learning_study --configs recipes/configs/study_grpo.yaml recipes/configs/study_supo.yaml \\
-        --seeds 0 1 2 --out runs/study
+    python -m recipes.learning_study --config recipes/configs/transfer_minigrid_cpu.yaml --dry-run
+    python -m recipes.learning_study --config recipes/configs/transfer_minigrid_cpu.yaml --jobs 2
 
-Every run is a process of its own (`OUT/NAME-sSEED`) and goes on where it stopped; so does the evaluation. What comes
-out: `study.md` (gains per training seed and over all of them), `results.md` (the whole matrix), `curves.png`.
-All configs must name the same model, warm start and world: then one starting policy is the baseline of all.
+One YAML says everything (`eval.study.plan`); files may extend each other. Every training run is a process of its own
+under `OUT/runs` and goes on where it stopped, the evaluation goes on from its store: the same command again does what
+is left. Then it audits all runs and writes `OUT/report` (also `agentspec report OUT --to FOLDER`).
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recipes.common import CONFIGS, run_recipe, unit
+import yaml
+
+from recipes.common import CONFIGS, run_recipe
 
 if TYPE_CHECKING:
-    from eval.statistics import Estimate
-
-START = "start"
+    from eval.study import Study
 
 
 def main() -> None:
-    """Train what is not trained, evaluate what is not evaluated, write the report."""
-    from trainers.arguments import parse_config
+    """Train what is not trained, evaluate what is not evaluated, audit, report."""
+    from agentspec.registry import SpecError
+    from eval.study import read_study
+    from trainers.arguments import read_layers
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
-    parser.add_argument("--configs", nargs="+", required=True, help="training configurations, one per method")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="training seeds")
-    parser.add_argument("--out", default="runs/study", help="folder of all runs and of the report")
-    parser.add_argument("--no-train", action="store_true", help="evaluate the runs that are there")
+    parser.add_argument("--config", metavar="FILE", help="the study, or the name of one that ships")
+    parser.add_argument("--out", metavar="DIR", help="folder of runs and report (default: the study's `out`)")
+    parser.add_argument("--dry-run", action="store_true", help="print runs, episodes and estimated hours; do nothing")
+    parser.add_argument("--no-train", action="store_true", help="evaluate the runs that have ended")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="training runs side by side, one thread each")
     options = parser.parse_args()
-    out = Path(options.out)
-    configs = {
-        Path(path).stem: parse_config(["--config", path], default=CONFIGS / "cpu.yaml") for path in options.configs
-    }
-    check(configs)
-    runs = {name: {seed: out / f"{name}-s{seed}" for seed in options.seeds} for name in configs}
+    if not options.config:
+        shipped = ", ".join(sorted(path.stem for path in CONFIGS.glob("transfer_*.yaml")))
+        raise SpecError(f"a study is one YAML file: give --config FILE, or the name of one that ships ({shipped})")
+    data = read_layers(options.config, shelf=CONFIGS)
+    study = read_study({**data, "out": options.out} if options.out else data)
+    configs = {name: arm_config(study, name) for name in study.arms}
+    if options.dry_run:
+        print(planned(study, configs))
+        return
     if not options.no_train:
-        for path, (_, folders) in zip(options.configs, runs.items(), strict=True):
-            for seed, folder in folders.items():
-                train(path, seed, folder)
-    report(configs, runs, out)
+        train_all(study, max(1, options.jobs))
+    evaluate_all(study, configs)
 
 
-def check(configs: Mapping[str, Any]) -> None:
-    """One baseline serves all configurations.
+def written(study: Study, name: str, data: Mapping[str, Any], begun: bool) -> Any:
+    """The configuration `data`, kept as a file that its runs are started with.
 
     Raises:
-        SpecError: two of them have the same name, or differ in model, adapter, world or held-out tasks.
+        SpecError: what is wrong with it, or (`begun`) there are runs of another one.
+    """
+    from agentspec.files import write_atomic
+    from agentspec.registry import SpecError
+    from trainers.arguments import parse_config
+
+    path, text = Path(study.out) / "configs" / f"{name}.yaml", yaml.safe_dump(dict(data))
+    if begun and path.is_file() and path.read_text() != text:
+        raise SpecError(f"{path}: {name!r} has runs of another configuration; choose another `out`, or remove them")
+    write_atomic(path, text)
+    return parse_config(["--config", str(path)], default=CONFIGS / "cpu.yaml")
+
+
+def arm_config(study: Study, name: str) -> Any:
+    """The training configuration of an arm, checked.
+
+    Raises:
+        SpecError: as `written`, or its trainer would change the scaffold.
     """
     from agentspec.registry import SpecError
+    from trainers.memory import as_memory
+    from trainers.supo import as_supo
 
-    first, *others = configs.items()
-    for name, config in others:
-        for field in ("model", "adapter", "environment", "eval_tasks", "eval_sampling"):
-            mine, theirs = getattr(config, field), getattr(first[1], field)
-            if mine != theirs:
-                raise SpecError(
-                    f"{field} is {mine!r} in {name} and {theirs!r} in {first[0]}; a study compares like with like"
-                )
+    arm = study.arms[name]
+    agent = study.scaffolds[arm.scaffold]
+    start = {"adapter": str(study.start)} if study.start else {}
+    data = {**study.train, **start, **arm.fields, "agent": agent.to_data()}
+    config = written(study, name, data, name in dict(study.begun))
+    config = {"supo": as_supo, "memory": as_memory}.get(arm.trainer, lambda given: given)(config)
+    config.check()
+    if config.spec.memory != agent.memory:
+        raise SpecError(f"arm {name!r}: {arm.trainer} trains in memory {config.spec.memory}, {arm.scaffold!r} has none")
+    return config
 
 
-def train(path: str, seed: int, folder: Path) -> None:
-    """One training run in a process of its own; a finished one is only loaded.
+def train_all(study: Study, jobs: int) -> None:
+    """The warm start, then every training run that has not ended, `jobs` at a time.
+
+    Raises:
+        SystemExit: one failed; the others go on to their ends.
+    """
+    if study.start and not (study.start / "manifest.json").is_file():  # it is written last
+        written(study, "warmup", study.warmup, False)
+        process(study, "warm start", "sft_warmup", "warmup", study.start)
+
+    def one(run: tuple[str, int]) -> None:
+        more = ("--seed", str(run[1]), "--resume", "true")
+        process(study, f"train {run[0]}", study.arms[run[0]].recipe, run[0], study.folder(*run), *more)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(one, [run for run in study.runs if run not in study.ended]))
+
+
+def process(study: Study, what: str, recipe: str, config: str, folder: Path, *more: str) -> None:
+    """One recipe in a process of its own; what it took is a line of `costs.jsonl`.
 
     Raises:
         SystemExit: it failed.
     """
-    command = [sys.executable, "-m", "agentspec.cli", "train", "grpo_delivery", "--config", path]
-    command += ["--seed", str(seed), "--output_dir", str(folder), "--resume", "true"]
-    print(f"{folder}: {' '.join(command)}", file=sys.stderr, flush=True)
-    if subprocess.run(command, check=False).returncode:
-        raise SystemExit(f"{folder}: training failed (see above); the same command goes on from its last checkpoint")
+    from agentspec.files import append_lines
+
+    file = Path(study.out) / "configs" / f"{config}.yaml"
+    command = [sys.executable, "-m", "agentspec.cli", "train", recipe, "--config", str(file)]
+    command += ["--output_dir", str(folder), *more]
+    print(f"{what}: {' '.join(command)}", file=sys.stderr, flush=True)
+    started = subprocess.Popen(command, env={"OMP_NUM_THREADS": "1", **os.environ})
+    _, status, usage = os.wait4(started.pid, 0)
+    started.returncode = os.waitstatus_to_exitcode(status)
+    if started.returncode:
+        raise SystemExit(f"{folder}: failed (see above); the same command goes on from its last checkpoint")
+    spent = {"what": what, "run": folder.name, "cpu_s": round(usage.ru_utime + usage.ru_stime, 1)}
+    append_lines(Path(study.out) / "costs.jsonl", spent)
 
 
-def report(configs: Mapping[str, Any], runs: Mapping[str, Mapping[int, Path]], out: Path) -> None:
-    """Play the matrix and write tables and curves."""
-    from agentspec.files import write_atomic
-    from agentspec.llm.models import resolve_adapter
+def held_out(study: Study, config: Any) -> dict[str, Any]:
+    """The tasks that all policies play."""
     from agentspec.tasks import make_tasks
-    from eval.matrix import Policy, evaluate
-    from eval.plots import learning_curves
-    from eval.tables import write_report
-    from trainers.config import agent_spec
-    from trainers.run_folder import METRICS
-    from trainers.runlog import RunLog
+
+    name, options = config.world
+    return {name: make_tasks(name, options, study.tasks, split="test")}
+
+
+def evaluate_all(study: Study, configs: Mapping[str, Any]) -> None:
+    """Play the matrix, audit every run, write `study.json` and the report."""
+    from agentspec.files import append_lines, write_atomic
+    from agentspec.llm.models import resolve_adapter
+    from eval.live import LiveTable
+    from eval.matrix import evaluate
+    from eval.report import build_report, write_files
+    from eval.study.cost import cpu_seconds
+
+    out, before, config = Path(study.out), cpu_seconds(), next(iter(configs.values()))
+    start = str(resolve_adapter(config.adapter)) if config.adapter else ""
+    policies = study.policies(config.model, start, lora=bool(config.lora_r or start))
+    tasks = held_out(study, config)
+    evaluate(policies, study.scaffolds, tasks, out=out, settings=study.settings, observer=LiveTable())
+    append_lines(out / "costs.jsonl", {"what": "evaluation", "cpu_s": round(cpu_seconds() - before, 1)})
+    rollouts = {name: c.generation_batch_size for name, c in configs.items()}
+    write_atomic(out / "study.json", study.record(rollouts, {run: receipt(study.folder(*run)) for run in study.ended}))
+    for path in write_files(build_report(out, title=out.name), out / "report"):
+        print(path)
+
+
+def receipt(folder: Path) -> dict[str, Any]:
+    """What the audit of a run says."""
+    from agentspec.files import file_digest
+    from trainers.audit import audit
+
+    found = list(audit(folder))
+    told = {"violations": [v for f in found for v in f.violations], "notes": [n for f in found for n in f.notes]}
+    return {"updates": sum(f.round is not None for f in found), "head": file_digest(folder / "seal.json"), **told}
+
+
+def planned(study: Study, configs: Mapping[str, Any]) -> str:
+    """Runs, episodes, hours and the smallest difference that would be found."""
+    from eval.study.cost import Rounds, estimate
 
     config = next(iter(configs.values()))
-    name, options = config.world
-    specs = [agent_spec(s) for c in configs.values() for s in (c.spec.to_data(), *(c.eval_specs or []))]
-    start = resolve_adapter(config.adapter) if config.adapter else ""
-    policies = [Policy(START, model=config.model, adapter=start)]
-    for method, folders in runs.items():
-        policies += [Policy(f"{method}-s{seed}", config.model, str(folder)) for seed, folder in folders.items()]
-    policies += [Policy("rule_based"), Policy("random")]
-    rows = evaluate(
-        policies,
-        {s.label: s for s in specs},
-        make_tasks(name, options, config.eval_tasks, split="test"),
-        out=out,
-        sampling=config.evaluation_sampling,
-        on_row=lambda row: print(row["policy"], row["scaffold"], row["task"], row.get("return"), file=sys.stderr),
-    )
-    write_report(rows, out)
-    own = {method: c.spec.label for method, c in configs.items()}
-    write_atomic(out / "study.md", gains(rows, {m: list(f) for m, f in runs.items()}, own))
-    logs = {m: [RunLog(f).read(METRICS) for f in folders.values()] for m, folders in runs.items()}
-    learning_curves(logs, out / "curves.png", unit=unit(config))
-    print((out / "study.md").read_text())
-
-
-def gains(rows: Sequence[Mapping[str, Any]], seeds: Mapping[str, Sequence[int]], own: Mapping[str, str]) -> str:
-    """Markdown: what each training run gained over the start, on the same tasks, under every scaffold.
-
-    Args:
-        rows: of the evaluation.
-        seeds: method -> training seeds.
-        own: method -> label of the scaffold it was trained in.
-    """
-    from agentspec.metrics import primary_metric
-    from eval.statistics import compare_runs, corrected
-    from eval.tables import table, values_by_task
-
-    primary = primary_metric(rows)
-    metric, digits = primary.name, primary.digits
-    scaffolds = list(dict.fromkeys(row["scaffold"] for row in rows))
-    cells = {
-        (policy, s): values_by_task([r for r in rows if (r["policy"], r["scaffold"]) == (policy, s)], metric)
-        for policy in dict.fromkeys(row["policy"] for row in rows)
-        for s in scaffolds
+    rounds = {
+        name: Rounds(c.max_steps * c.gradient_accumulation_steps // c.steps_per_generation, c.generation_batch_size)
+        for name, c in configs.items()
     }
-    compared: list[tuple[str, str, Mapping[str, float], list[Mapping[str, float]]]] = []
-    for method, numbers in seeds.items():
-        for scaffold in scaffolds:
-            before, *after = (cells[p, scaffold] for p in (START, *(f"{method}-s{n}" for n in numbers)))
-            where = f"{scaffold} (its own)" if scaffold == own[method] else scaffold
-            compared.append((method, where, before, after))
-    gains_over_runs = corrected([compare_runs(after, [before]) for _, _, before, after in compared])
-    body = [
-        [method, where, *_compared(before, after, gain, digits)]
-        for (method, where, before, after), gain in zip(compared, gains_over_runs, strict=True)
-    ]
-    header = [
-        "trained with",
-        "evaluated in",
-        "before",
-        "after (all seeds)",
-        "gain (all seeds)",
-        "p",
-        "verdict",
-        "gain per seed",
-        "tasks",
-    ]
-    lines = [
-        f"# {primary.heading} before and after training",
-        "",
-        "Greedy, on held-out tasks, paired by task. 95 % t intervals: per seed over tasks (that checkpoint only),",
-        "for all seeds over training runs. p-values of the gains over runs, Holm over the table; above 0.05 is a tie.",
-        "",
-        *table(header, body),
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _compared(
-    before: Mapping[str, float], after: Sequence[Mapping[str, float]], gain: Estimate, digits: int
-) -> list[str]:
-    """Cells of one row, from values by task of the start and of each run; a task that one of them lacks is out."""
-    from eval.statistics import mean_interval, runs_mean
-    from eval.tables import show
-
-    tasks = [t for t in before if all(t in values for values in after)]
-    gained = [[values[t] - before[t] for t in tasks] for values in after]
-    start = mean_interval([before[t] for t in tasks])
-    end = runs_mean([{t: values[t] for t in tasks} for values in after])
-    each = ", ".join(show(mean_interval(g), digits) for g in gained)
-    verdict = "tie" if gain.tie() else "gain" if gain.mean > 0 else "loss"
-    p = "–" if math.isnan(gain.p) else f"{gain.p:.3f}"
-    return [show(start, digits), show(end, digits), show(gain, digits), p, verdict, each, str(len(tasks))]
+    warm = written(study, "warmup", study.warmup, False) if study.warmup else None
+    warmup = (warm.train_tasks, warm.num_train_epochs) if warm else (0, 0.0)
+    lora = bool(config.lora_r or config.adapter)
+    tasks = held_out(study, config)
+    return estimate(study, config.model, tasks, rounds, start=config.adapter, lora=lora, warmup=warmup)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def parsed(name: str, *overrides: str) -> Any:
 
 
 def test_every_shipped_config_is_sound(tmp_path: Path) -> None:
-    names = sorted(p.name for p in CONFIGS.glob("*.yaml"))
+    names = sorted(p.name for p in CONFIGS.glob("*.yaml") if not p.name.startswith("transfer_"))  # these are studies
     assert {"quickstart_cpu.yaml", "qwen3_4b_paper.yaml", "supo_cpu.yaml"} <= set(names)
     for name in names:
         config = parsed(name, *ON_CPU, "--output_dir", str(tmp_path))

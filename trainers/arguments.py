@@ -70,12 +70,17 @@ def read_config(path: str | Path, *, shelf: Path | None = None) -> dict[str, Any
     Raises:
         SpecError: malformed YAML, an unknown key, or a field that nobody reads.
     """
-    data = _read(_found(Path(path), shelf), (), shelf)
+    data = read_layers(path, shelf=shelf)
     for key in data:
         if key not in KNOWN:
             raise SpecError(f"{path}: unknown key {key!r}{suggest(str(key), KNOWN)}")
     check_given(data, str(path))
     return data
+
+
+def read_layers(path: str | Path, *, shelf: Path | None = None) -> dict[str, Any]:
+    """A YAML file over those it extends, whatever its keys mean; arguments and errors as of `read_config`."""
+    return _read(_found(Path(path), shelf), (), shelf)
 
 
 def _found(path: Path, shelf: Path | None) -> Path:

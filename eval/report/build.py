@@ -24,6 +24,8 @@ from eval.report.costs import costs_section, fronts_section
 from eval.report.data import as_csv, as_parquet
 from eval.report.modules import modules_section
 from eval.report.sections import failures_section, learning_section, paper_section
+from eval.report.training import study_runs
+from eval.report.transfer import transfer_section
 from eval.statistics import Estimate, least_p, minimum_detectable_effect, runs_mean
 from eval.tables import difference_rows, differences, differences_caption, show, summarise, values_by_run
 
@@ -77,7 +79,8 @@ def build_report(
             *fronts_section(tasks, members),
         ]
     blocks += _worlds(rows)
-    blocks += learning_section(runs or {})
+    blocks += transfer_section(rows, path.parent)
+    blocks += learning_section(runs or study_runs(path.parent))
     blocks += failures_section(rows, path.parent, paper=paper)
     blocks += costs_section(rows)
     if paper:
