@@ -11,11 +11,7 @@ is left. Then it audits all runs and writes `OUT/report` (also `agentspec report
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +27,7 @@ def main() -> None:
     """Train what is not trained, evaluate what is not evaluated, audit, report."""
     from agentspec.registry import SpecError
     from eval.study import read_study
+    from eval.study.training import train_all
     from trainers.arguments import read_layers
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
@@ -46,8 +43,9 @@ def main() -> None:
     data = read_layers(options.config, shelf=CONFIGS)
     study = read_study({**data, "out": options.out} if options.out else data)
     configs = {name: arm_config(study, name) for name in study.arms}
+    warm = written(study, "warmup", study.warmup, False) if study.warmup else None
     if options.dry_run:
-        print(planned(study, configs))
+        print(planned(study, configs, warm))
         return
     if not options.no_train:
         train_all(study, max(1, options.jobs))
@@ -93,45 +91,6 @@ def arm_config(study: Study, name: str) -> Any:
     return config
 
 
-def train_all(study: Study, jobs: int) -> None:
-    """The warm start, then every training run that has not ended, `jobs` at a time.
-
-    Raises:
-        SystemExit: one failed; the others go on to their ends.
-    """
-    if study.start and not (study.start / "manifest.json").is_file():  # it is written last
-        written(study, "warmup", study.warmup, False)
-        process(study, "warm start", "sft_warmup", "warmup", study.start)
-
-    def one(run: tuple[str, int]) -> None:
-        more = ("--seed", str(run[1]), "--resume", "true")
-        process(study, f"train {run[0]}", study.arms[run[0]].recipe, run[0], study.folder(*run), *more)
-
-    with ThreadPoolExecutor(jobs) as pool:
-        list(pool.map(one, [run for run in study.runs if run not in study.ended]))
-
-
-def process(study: Study, what: str, recipe: str, config: str, folder: Path, *more: str) -> None:
-    """One recipe in a process of its own; what it took is a line of `costs.jsonl`.
-
-    Raises:
-        SystemExit: it failed.
-    """
-    from agentspec.files import append_lines
-
-    file = Path(study.out) / "configs" / f"{config}.yaml"
-    command = [sys.executable, "-m", "agentspec.cli", "train", recipe, "--config", str(file)]
-    command += ["--output_dir", str(folder), *more]
-    print(f"{what}: {' '.join(command)}", file=sys.stderr, flush=True)
-    started = subprocess.Popen(command, env={"OMP_NUM_THREADS": "1", **os.environ})
-    _, status, usage = os.wait4(started.pid, 0)
-    started.returncode = os.waitstatus_to_exitcode(status)
-    if started.returncode:
-        raise SystemExit(f"{folder}: failed (see above); the same command goes on from its last checkpoint")
-    spent = {"what": what, "run": folder.name, "cpu_s": round(usage.ru_utime + usage.ru_stime, 1)}
-    append_lines(Path(study.out) / "costs.jsonl", spent)
-
-
 def held_out(study: Study, config: Any) -> dict[str, Any]:
     """The tasks that all policies play."""
     from agentspec.tasks import make_tasks
@@ -171,7 +130,7 @@ def receipt(folder: Path) -> dict[str, Any]:
     return {"updates": sum(f.round is not None for f in found), "head": file_digest(folder / "seal.json"), **told}
 
 
-def planned(study: Study, configs: Mapping[str, Any]) -> str:
+def planned(study: Study, configs: Mapping[str, Any], warm: Any) -> str:
     """Runs, episodes, hours and the smallest difference that would be found."""
     from eval.study.cost import Rounds, estimate
 
@@ -180,7 +139,6 @@ def planned(study: Study, configs: Mapping[str, Any]) -> str:
         name: Rounds(c.max_steps * c.gradient_accumulation_steps // c.steps_per_generation, c.generation_batch_size)
         for name, c in configs.items()
     }
-    warm = written(study, "warmup", study.warmup, False) if study.warmup else None
     warmup = (warm.train_tasks, warm.num_train_epochs) if warm else (0, 0.0)
     lora = bool(config.lora_r or config.adapter)
     tasks = held_out(study, config)

@@ -41,16 +41,16 @@ def train_warmup(config: Any) -> None:
     name, options = config.world
     model, tokenizer = load_policy(config)
     tasks = make_tasks(name, options, config.train_tasks)
-    shown = demonstrate(config.mixture, tokenizer, tasks, config.train_filter, config.seed)
-    returns = [float(t.metrics["return"]) for t in shown.episodes]
-    print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(shown.rows)} rows")
+    rows, episodes = demonstrate(config.mixture, tokenizer, tasks, config.train_filter, config.seed)
+    returns = [float(t.metrics["return"]) for t in episodes]
+    print(f"{len(returns)} demonstrations, mean return {sum(returns) / len(returns):.2f}, {len(rows)} rows")
     same = (
         "output_dir per_device_train_batch_size gradient_accumulation_steps num_train_epochs max_steps learning_rate "
         "lr_scheduler_type warmup_steps logging_steps report_to use_cpu bf16 seed"
     )
     given = {field: getattr(config, field) for field in (*same.split(), CHECKPOINTING)}
     args = SFTConfig(**given, max_length=None, save_strategy="no")
-    data = Dataset.from_list(shown.rows)
+    data = Dataset.from_list(rows)
     trainer = DemonstrationTrainer(model, args, train_dataset=data, processing_class=tokenizer)
     trainer.train()
     trainer.save_model(config.output_dir)

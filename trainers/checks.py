@@ -106,7 +106,8 @@ def _values(config: ScaffoldConfig) -> Iterator[str]:
 
 def _calls(config: ScaffoldConfig) -> Iterator[str]:
     """Something is trained, and sampled so that it can be."""
-    spec, train, paths = config.spec, config.train_filter, config.spec.call_paths()
+    specs, train = config.mixture, config.train_filter
+    paths = [path for spec in specs for path in spec.call_paths()]
     for name in ("train_calls", "train_credits"):
         if not getattr(config, name):
             yield f"{name} is empty, so nothing would be trained; name some, or leave the field out"
@@ -114,6 +115,20 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
         if missing := unmatched_patterns(paths, TrainFilter(tuple(patterns))):
             there = ", ".join(sorted(set(paths))) or "none (no module calls the model)"
             yield f"{name} {missing} match no call of this scaffold, so they would change nothing; its calls: {there}"
+    for spec in specs:
+        yield from _trainable(spec, train)
+    over = any(spec.scope == "run" for spec in specs) or config.write_credit != "episode"
+    if config.scaffolds is not None and (over or config.num_generations % len(specs)):
+        yield (
+            f"scaffolds: the {config.num_generations} rollouts of a group are dealt out over {len(specs)} scaffolds; "
+            "that takes a multiple of them as num_generations, `scope: episode` and `write_credit: episode`"
+        )
+    if config.adapter and config.lora_r == 0:
+        yield f"adapter {config.adapter!r} with lora_r 0: all weights would be trained; merge it into a model"
+
+
+def _trainable(spec: AgentSpec, train: TrainFilter) -> Iterator[str]:
+    """What is trained of a scaffold is sampled so that it can be."""
     temperatures = {"sampling.temperature": spec.sampling.temperature}
     for kind in MODULE_KINDS:
         if why := REGISTRY.get(kind, getattr(spec, kind).name).declaration.untrainable:
@@ -121,7 +136,7 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
                 f"agent.{kind} {getattr(spec, kind).name!r} cannot be trained through: {why}; train inside a method of "
                 "this package, and evaluate with this one"
             )
-        if any(train.matches(p) for p in paths if p.startswith(f"{kind}.")):
+        if any(train.matches(p) for p in spec.call_paths() if p.startswith(f"{kind}.")):
             given = getattr(spec, kind).params.items()
             temperatures |= {f"{kind}.{n}": v for n, v in given if n.endswith("temperature") and v is not None}
     for name, value in temperatures.items():
@@ -134,8 +149,6 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
             "agent.sampling sets top_p or top_k: the update recomputes log-probabilities over the full distribution "
             "and would not match the sampled ones; train with top_p 1 and top_k 0"
         )
-    if config.adapter and config.lora_r == 0:
-        yield f"adapter {config.adapter!r} with lora_r 0: all weights would be trained; merge it into a model"
 
 
 def own_memory_paths(config: ScaffoldConfig) -> list[str]:

@@ -170,7 +170,7 @@ class ScaffoldConfig(GRPOConfig):
     @property
     def mixture(self) -> list[AgentSpec]:
         """The training scaffolds: `spec`, or those of `scaffolds`."""
-        return mixture(self.spec.to_data(), self.scaffolds, self.held_out)
+        return [self.spec] if self.scaffolds is None else mixture(self.spec.to_data(), self.scaffolds, self.held_out)
 
     @property
     def credit_rule(self) -> CreditRule:

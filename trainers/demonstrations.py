@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,18 +23,10 @@ from trainers.sequences import Row, TokenSequence, TrainFilter, build_sequences
 from trainers.tree.model import enable_tree
 
 
-@dataclass(frozen=True)
-class Demonstrations:
-    """Rows of token ids and which of them the expert wrote (1), and the episodes they come from."""
-
-    rows: list[dict[str, list[int]]]
-    episodes: list[Trajectory]
-
-
 def demonstrate(
     specs: Sequence[AgentSpec], tokenizer: Any, tasks: Sequence[Task], train: TrainFilter, seed: int = 0
-) -> Demonstrations:
-    """The expert's episodes inside the scaffolds `specs`, each of which plays its share of the tasks.
+) -> tuple[list[dict[str, list[int]]], list[Trajectory]]:
+    """Rows of token ids and which of them the expert wrote (1), and its episodes inside the scaffolds `specs`.
 
     Of every `len(specs)` tasks in a row each scaffold plays one, drawn by `seed`: none gets the same level each time.
 
@@ -50,7 +41,7 @@ def demonstrate(
     episodes = [e for spec, share in zip(specs, shares, strict=True) for e in play_expert(spec, tokenizer, share)]
     sequences = (s for episode in episodes for s in build_sequences(episode, train))
     rows = [{"input_ids": s.tokens, "assistant_masks": [int(c >= 0) for c in s.calls]} for s in sequences]
-    return Demonstrations(rows, episodes)
+    return rows, episodes
 
 
 class DemonstrationTrainer(SFTTrainer):

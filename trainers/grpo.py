@@ -167,9 +167,17 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         )
 
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
-        """One episode per job, in order, those that failed among them; `spec`: another than the training scaffold."""
-        runner = self._runner(spec or self.args.spec)
-        return collect(runner, jobs, self.rewards_used, retries=self.args.retries)
+        """One episode per job, in order, those that failed among them; `spec`: another than the training scaffold.
+
+        Where there are several of these (`scaffolds`), rollout i of a task is played in the i-th, from the first again.
+        """
+        specs = [spec] if spec else self.args.mixture
+        played: dict[int, ScoredEpisode] = {}
+        for number, one in enumerate(specs):
+            if mine := [i for i, job in enumerate(jobs) if job.rollout % len(specs) == number]:
+                runner, share = self._runner(one), [jobs[i] for i in mine]
+                played |= zip(mine, collect(runner, share, self.rewards_used, retries=self.args.retries), strict=True)
+        return [played[i] for i in range(len(jobs))]
 
     @contextmanager
     def _current_weights(self) -> Iterator[None]:

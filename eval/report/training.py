@@ -91,13 +91,11 @@ def taken(rows: Sequence[Row], study: Mapping[str, Any], folder: Path) -> list[B
                 count, read, wrote = played.get(f"train {arm}", (0, 0.0, 0.0))
                 read += n * row.get("episode/input_tokens", 0.0)
                 played[f"train {arm}"] = (count + n, read, wrote + n * row.get("episode/output_tokens", 0.0))
-    model = [r for r in rows if r["status"] == "completed" and r.get("llm_calls")]
+    model = [r for r in rows if r["status"] == "completed" and r.get("input_tokens")]
     sums = [float(sum(r.get(name) or 0 for r in model)) for name in ("input_tokens", "output_tokens")]
     played["evaluation"] = (len(model), sums[0], sums[1])
     what = list(dict.fromkeys([*hours, *played]))
-    body = [
-        [w, *(f"{v:,.0f}" for v in played[w])] if w in played else [w, "–", "–", "–"] for w in what
-    ]
+    body = [[w, *(f"{v:,.0f}" for v in played[w])] if w in played else [w, "–", "–", "–"] for w in what]
     body = [[*line, f"{hours[w]:.2f}" if w in hours else "–"] for line, w in zip(body, what, strict=True)]
     totals = [sum(p[i] for p in played.values()) for i in range(3)]
     body.append(["in all", *(f"{v:,.0f}" for v in totals), f"{math.fsum(hours.values()):.2f}"])

@@ -28,7 +28,7 @@ def transfer_section(rows: Sequence[Row], folder: Path) -> list[Block]:
     study = read_study(folder)
     if not study:
         return []
-    metric, home = primary_metric(rows), {arm: item["scaffold"] for arm, item in study["arms"].items()}
+    metric, home = primary_metric(rows), {a: item["scaffold"] for a, item in study["arms"].items()}
     grouped: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         grouped.setdefault((row["policy"], row["scaffold"]), []).append(row)
@@ -80,7 +80,8 @@ def _paper_form(rows: Sequence[Row], study: Mapping[str, Any], values: Values, m
         for s in scaffolds
     ]
     trained = "; ".join(
-        f"{heading}: {policy}" + (f", trained in {study['arms'][policy]['scaffold']}" if policy in study["arms"] else "")
+        f"{heading}: {policy}"
+        + (f", trained in {study['arms'][policy]['scaffold'] or 'several'}" if policy in study["arms"] else "")
         for heading, policy in named.items()
     )
     caption = f"The paper's form: {metric.heading} by evaluation scaffold; {trained}. {unit_of(acting)}. {_traced()}"
@@ -94,13 +95,14 @@ def _matrix(rows: Sequence[Row], home: Mapping[str, str], values: Values, metric
         shown = [show(_estimate(values, policy, s), metric.digits) for s in scaffolds]
         marked = [f"{v} (home)" if home.get(policy) == s else v for v, s in zip(shown, scaffolds, strict=True)]
         runs = max(len(values.get((policy, s), {})) for s in scaffolds)
-        body.append([policy, home.get(policy, "–"), str(runs), *marked, _tokens(rows, policy=policy)])
+        body.append([policy, home.get(policy) or "–", str(runs), *marked, _tokens(rows, policy=policy)])
     caption = f"Trained in (row) x evaluated in (column): {metric.heading}; {unit_of(rows)}. Means over the tasks that "
     caption += f"were completed. {_traced()}"
     return Table(["policy", "trained in", "runs", *scaffolds, "tokens/episode"], body, caption)
 
 
 def _diagonal(home: Mapping[str, str], values: Values, metric: Metric) -> list[Block]:
+    home = {arm: scaffold for arm, scaffold in home.items() if scaffold}
     homes = list(dict.fromkeys(home.values()))
     runs = {arm: sorted({run for s in homes for run in values.get((arm, s), {})}) for arm in home}
     cells: Cells = {
@@ -157,7 +159,9 @@ def _gains(home: Mapping[str, str], values: Values, metric: Metric) -> list[Bloc
         [arm, f"{s} (home)" if home[arm] == s else s, *_difference(e, metric)]
         for (arm, s), e in zip(found, corrected([*found.values()]), strict=True)
     ]
-    caption = f"Gain over the start in {metric.heading}, on the same tasks; over training runs (fewer than {LEAST_RUNS}: "
+    caption = (
+        f"Gain over the start in {metric.heading}, on the same tasks; over training runs (fewer than {LEAST_RUNS}: "
+    )
     caption += "over tasks, this checkpoint only); p corrected by Holm over this table."
     return [
         Heading("What training gained", 3),

@@ -48,7 +48,7 @@ class Arm:
     """What is trained several times.
 
     Args:
-        scaffold: label of the scaffold it is trained in, its home.
+        scaffold: label of the scaffold it is trained in.
         trainer: see `TRAINERS`.
         fields: of the training configuration, over those that all arms share.
     """
@@ -56,6 +56,11 @@ class Arm:
     scaffold: str
     trainer: str = "grpo"
     fields: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def home(self) -> str:
+        """The scaffold it is trained in; empty if its groups are dealt out over several (`scaffolds`)."""
+        return "" if "scaffolds" in self.fields else self.scaffold
 
     @property
     def recipe(self) -> str:
@@ -135,7 +140,7 @@ class Study:
         arms = {}
         for name, arm in self.arms.items():
             runs = {str(s): f"runs/{self.folder(a, s).name}" for a, s in self.ended if a == name}
-            of = {"scaffold": arm.scaffold, "trainer": arm.trainer, "rollouts": rollouts[name]}
+            of = {"scaffold": arm.home, "trainer": arm.trainer, "rollouts": rollouts[name]}
             arms[name] = {**of, "runs": runs}
         found = {self.folder(*run).name: told for run, told in audits.items()}
         data = {"arms": arms, "audits": found, "table": dict(self.table), "compare": dict(self.compare)}

@@ -1,83 +1,193 @@
-"""The study's report: gains paired by task, per training seed and over all."""
+"""The study end to end with a tiny random model: trained, stopped, resumed, evaluated, audited, reported."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 pytest.importorskip("trl")
+pytest.importorskip("peft")
+pytest.importorskip("minigrid")
 
+from agentspec.files import read_lines
 from agentspec.registry import SpecError
+from eval.study import training
+from recipes import grpo_delivery, grpo_memory, learning_study, sft_warmup, supo_delivery
 from recipes.common import CONFIGS
-from recipes.learning_study import check, gains
-from trainers.arguments import parse_config
+from tests.tiny import tiny_model, tiny_tokenizer
+from trainers.arguments import read_layers
+
+RECIPES = {"grpo_delivery": grpo_delivery, "grpo_memory": grpo_memory, "supo_delivery": supo_delivery}
+SHEET = {"name": "dynamic_cheatsheet", "preset": "rl", "every": 2, "sheet_tokens": 8, "step_tokens": 8}
+SMALL = {"sampling": {"max_tokens": 8}, "layout": "snapshot"}
 
 
-def rows(policy: str, scaffold: str, values: list[float]) -> list[dict[str, object]]:
-    return [
-        {
-            "env": "deliverybench",
-            "policy": policy,
-            "scaffold": scaffold,
-            "tasks": "t",
-            "task": f"t{i}",
-            "status": "completed",
-            "net_earnings": v,
-        }
-        for i, v in enumerate(values)
-    ]
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("base")
+    tokenizer = tiny_tokenizer()
+    small = {"num_hidden_layers": 1, "hidden_size": 32, "intermediate_size": 32, "max_position_embeddings": 16_384}
+    tiny_model(tokenizer, **small).save_pretrained(folder)
+    tokenizer.save_pretrained(folder)
+    return folder
 
 
-def test_gains_are_paired_by_task() -> None:
-    played = [
-        *rows("start", "bare", [1.0, 2.0, 3.0, 4.0]),
-        *rows("grpo-s0", "bare", [3.0, 4.0, 5.0, 6.0]),  # +2 on every task: no spread
-        *rows("grpo-s1", "bare", [5.0, 6.0, 7.0, 8.0]),  # +4
-        *rows("grpo-s2", "bare", [4.0, 5.0, 6.0, 7.0]),  # +3
-    ]
-    text = gains(played, {"grpo": [0, 1, 2]}, {"grpo": "bare"})
-    line = next(line for line in text.splitlines() if line.startswith("| grpo"))
-    cells = [c.strip() for c in line.strip("|").split("|")]
-    assert cells[1] == "bare (its own)"
-    assert cells[2].startswith("2.50 ") and cells[3].startswith("5.50 ")
-    # Gains of the runs 2, 4, 3: 3 -+ 4.3027 / sqrt 3, t = 3 sqrt 3 with 2 degrees of freedom: p = .0351
-    assert cells[4:7] == ["3.00 [0.52, 5.48]", "0.035", "gain"]
-    assert cells[7] == "2.00 [2.00, 2.00], 4.00 [4.00, 4.00], 3.00 [3.00, 3.00]"
-    assert cells[8] == "4"
+def study(base: Path, out: Path, **changes: Any) -> dict[str, Any]:
+    world = {"name": "minigrid", "options": {"level": "MiniGrid-MemoryS7-v0", "observation": "compact"}}
+    world["options"] |= {"action_mode": "menu", "max_steps": 3}
+    train = {"extends": "minigrid_cpu", "model": str(base), "adapter": "", "environment": world, "max_steps": 1}
+    train["environment"]["options"]["suite"] = None
+    train |= {"num_generations": 2, "per_device_train_batch_size": 1, "gradient_accumulation_steps": 2}
+    train |= {"lora_layers": 0, "plots": False, "train_tasks": 4, "rewards": {"success": 1.0, "efficiency": None}}
+    return {
+        "out": str(out),
+        "seeds": [0],
+        "tasks": 2,
+        "scaffolds": {"none": SMALL, "sheet": {**SMALL, "memory": SHEET}},
+        "train": train,
+        # A random model never ends its sheet, and what is cut off would not be trained.
+        "arms": {
+            "none": {"scaffold": "none"},
+            "sheet": {"scaffold": "sheet", "trainer": "memory", "mask_truncated": ["reasoning.*"]},
+        },
+        "references": ["random"],
+        "rates": {"read": 100, "write": 10, "update": 50},
+        **changes,
+    }
 
 
-def test_one_run_says_nothing_about_its_recipe() -> None:
-    played = [*rows("start", "bare", [1.0, 2.0]), *rows("grpo-s0", "bare", [3.0, 4.0])]
-    line = gains(played, {"grpo": [0]}, {"grpo": "bare"}).splitlines()[-1]
-    # Two seeds, both +2: of four flips two are as far, p = .5
-    assert "| 0.500 | tie |" in line
+def written(folder: Path, data: dict[str, Any]) -> str:
+    path = folder / "study.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
 
 
-def test_a_task_that_failed_for_one_run_counts_for_none() -> None:
-    played = [*rows("start", "bare", [0.0, 0.0]), *rows("grpo-s0", "bare", [1.0, 9.0])]
-    played[-1] = {**played[-1], "status": "failed"}
-    line = gains(played, {"grpo": [0]}, {"grpo": "bare"}).splitlines()[-1]
-    assert "| 1.00 |" in line and line.endswith("| 1 |")
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["learning_study", *words])
+    learning_study.main()
 
 
-def test_the_shipped_study_compares_like_with_like() -> None:
-    grpo, supo = (parse_config([], default=CONFIGS / f"study_{name}.yaml") for name in ("grpo", "supo"))
-    grpo.check()
-    supo.check()
-    check({"grpo": grpo, "supo": supo})
-    assert grpo.spec == replace(supo.spec, memory=grpo.spec.memory)
-    supo.eval_tasks = 4
-    with pytest.raises(SpecError, match="eval_tasks is 4 in supo and 32 in grpo"):
-        check({"grpo": grpo, "supo": supo})
+def test_two_scaffolds_and_one_update_end_to_end(
+    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every run a process of its own, as for real."""
+    out = tmp_path / "out"
+    asked = {"table": {"Non-RL": "start", "GRPO": "none"}, "compare": {"notes": ["none", "sheet"]}}
+    config = written(tmp_path, study(base, out, **asked))
+    run(monkeypatch, "--config", config, "--dry-run")
+    said = capsys.readouterr().out
+    assert "2 training runs" in said and "3 policies x 2 scaffolds x 2 episodes = 12 episodes" in said
+    assert not (out / "runs").exists() and not (out / "results.jsonl").exists()
+    run(monkeypatch, "--config", config, "--jobs", "2")
+    text = (out / "report" / "report.md").read_text()
+    for heading in ("The paper's table", "Is a policy best where it was trained?", "What training gained"):
+        assert heading in text
+    for heading in ("Compared in pairs", "What was trained", "What it took", "Audit receipts"):
+        assert heading in text
+    assert "this checkpoint only" in text and "memory.dynamic_cheatsheet/curate" in text
+    told = json.loads((out / "study.json").read_text())
+    assert {name: found["violations"] for name, found in told["audits"].items()} == {"none-s0": [], "sheet-s0": []}
+    assert all(found["updates"] == 1 for found in told["audits"].values())
+    rows, kept = read_lines(out / "results.jsonl"), {line["key"] for line in read_lines(out / "episodes.jsonl")}
+    # start, two runs and a scripted policy, in two scaffolds, on two tasks; every number has its episode in the store.
+    # (The scripted one writes no sheet: its episodes in both are the same, and kept once.)
+    assert len(rows) == 16 and {row["key"] for row in rows} == kept and len(kept) == 14
+    spent = [line["what"] for line in read_lines(out / "costs.jsonl")]
+    assert sorted(spent) == ["evaluation", "train none", "train sheet"]
+    # Again: nothing is left to train or to play.
+    monkeypatch.setattr(training, "process", None)
+    run(monkeypatch, "--config", config)
+    assert len(read_lines(out / "episodes.jsonl")) == 14
 
 
-def test_curves_are_drawn(tmp_path: Path) -> None:
-    from eval.plots import learning_curves
+def here(study: Any, what: str, recipe: str, config: str, folder: Path, *more: str) -> None:
+    """In the place of `eval.study.training.process`: the recipe in this process."""
+    file = Path(study.out) / "configs" / f"{config}.yaml"
+    main = sft_warmup.main if recipe == "sft_warmup" else RECIPES[recipe].main
+    sys.argv = [recipe, "--config", str(file), "--output_dir", str(folder), *more]
+    main()
 
-    run = [{"step": s, "reward": float(s)} for s in (1, 2, 3)]
-    assert learning_curves({"grpo": [run, run[:2]], "empty": [[]]}, tmp_path / "c.png")
-    assert (tmp_path / "c.png").stat().st_size > 1000
-    assert not learning_curves({"grpo": [[]]}, tmp_path / "none.png")
-    assert not (tmp_path / "none.png").exists()
+
+def test_a_study_killed_after_one_arm_goes_on_where_it_stopped(
+    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a warm start that is a mixture, which both arms begin with."""
+    out = tmp_path / "out"
+    warm = {"extends": "warmup_minigrid", "model": str(base), "environment": study(base, out)["train"]["environment"]}
+    warm |= {"agent": {"sampling": {"max_tokens": 512}}, "scaffolds": [{"memory": ["none", SHEET]}], "train_tasks": 4}
+    warm |= {"train_calls": ["reasoning.*", "memory.*"], "train_credits": ["executed", "aux"], "lora_layers": 0}
+    warm |= {"warmup_steps": 0, "per_device_train_batch_size": 2, "max_steps": 2}
+    config = written(tmp_path, study(base, out, warmup=warm))
+    done: list[str] = []
+
+    def dies(study: Any, what: str, *given: Any) -> None:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(what)
+        here(study, what, *given)
+
+    monkeypatch.setattr(training, "process", dies)
+    with pytest.raises(KeyboardInterrupt):
+        run(monkeypatch, "--config", config)
+    assert done == ["warm start", "train none"] and not (out / "results.jsonl").exists()
+    head = (out / "runs" / "none-s0" / "seal.json").read_bytes()
+    again: list[str] = []
+
+    def notes(study: Any, what: str, *given: Any) -> None:
+        again.append(what)
+        here(study, what, *given)
+
+    monkeypatch.setattr(training, "process", notes)
+    run(monkeypatch, "--config", config)
+    assert again == ["train sheet"] and (out / "runs" / "none-s0" / "seal.json").read_bytes() == head
+    manifest = json.loads((out / "runs" / "sheet-s0" / "manifest.json").read_text())
+    assert manifest["config"]["adapter"] == str(out / "warmup")
+    assert {row["policy"] for row in read_lines(out / "results.jsonl")} == {"start", "none", "sheet", "random"}
+    # A changed arm under the same name would mix two recipes in one row of the table.
+    changed = study(base, out, warmup=warm)
+    changed["arms"]["none"]["learning_rate"] = 0.5
+    with pytest.raises(SpecError, match="'none' has runs of another configuration"):
+        run(monkeypatch, "--config", written(tmp_path, changed))
+
+
+def test_a_missing_study_is_told_with_those_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SpecError, match=r"give --config FILE.*transfer_cpu, transfer_minigrid_cpu"):
+        run(monkeypatch)
+
+
+@pytest.mark.parametrize("name", ["transfer_cpu", "transfer_minigrid_cpu", "transfer_qwen3_4b"])
+def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
+    from eval.study import read_study
+    from eval.study.cost import Rates
+
+    data = read_layers(name, shelf=CONFIGS)
+    on_cpu = {"use_cpu": True, "bf16": False, "report_to": "none", "use_vllm": False}
+    if name == "transfer_qwen3_4b":
+        for key in [k for k in read_layers("qwen3_4b_paper", shelf=CONFIGS) if k.startswith("vllm")]:
+            on_cpu[key] = None
+        data["train"] |= on_cpu
+    given = read_study({**data, "out": str(tmp_path)})
+    assert len(given.seeds) >= 3 and given.tasks >= 32 and Rates.from_data(given.rates)
+    for arm in given.arms:
+        config = learning_study.arm_config(given, arm)
+        assert config.spec.label == given.scaffolds[given.arms[arm].scaffold].label
+    if given.warmup:
+        warm = learning_study.written(given, "warmup", given.warmup, False)
+        labels = {spec.label for spec in warm.mixture}
+        # The start has met every scaffold that somebody is trained in, and none that is held out.
+        assert {given.scaffolds[arm.scaffold].label for arm in given.arms.values()} <= labels
+        assert not any("mad" in label or "openclaw" in label for label in labels)
+
+
+def test_the_paper_s_six_are_evaluated() -> None:
+    from eval.study import read_study
+
+    scaffolds = read_study(read_layers("transfer_cpu", shelf=CONFIGS)).scaffolds.values()
+    agents = {(spec.reasoning.name, spec.memory.name) for spec in scaffolds}
+    sheets = {("react", memory) for memory in ("dynamic_cheatsheet", "memorybank", "openclaw", "base")}
+    assert sheets | {("direct", "base"), ("mad", "base")} <= agents

@@ -9,8 +9,10 @@ import pytest
 
 pytest.importorskip("trl")
 
+from agentspec.registry import SpecError
 from tests.trainers.test_resume import trainer
 from trainers.audit import audit
+from trainers.runlog import RunLog
 
 SPECS: list[dict[str, Any]] = [
     {"reasoning": {"name": "react", "thought_tokens": 4}},
@@ -40,3 +42,39 @@ def test_three_updates_inside_a_scaffold(tmp_path: Path, spec: dict[str, Any], e
     assert len(receipts) == 3
     assert [v for r in receipts for v in r.violations] == []
     assert all(r.trained == r.denominator > 0 for r in receipts)
+
+
+def test_a_group_over_two_scaffolds(tmp_path: Path) -> None:
+    """Rollouts of a task are dealt out; they are one group all the same, and the audit makes the same of them."""
+    run = trainer(
+        tmp_path,
+        agent={"sampling": {"max_tokens": 6}},
+        scaffolds=[{"memory": ["none", "base"], "layout": "snapshot"}],
+        max_steps=2,
+        save_steps=2,
+    )
+    run.train()
+    receipts = list(audit(tmp_path))
+    assert [r.violations for r in receipts] == [[], []]
+    group = run.args.num_generations
+    played = [t.spec["memory"] for t in run.last_episodes]
+    assert played == ["none", "base"] * (len(played) // 2) and group % 2 == 0
+    rounds = RunLog(tmp_path).read("updates.jsonl")
+    for start in range(0, len(played), group):  # the advantage of a group's episodes, over both scaffolds, sums to 0
+        by_episode = {row["episode"]: row["advantage"] for row in rounds[-1]["rows"]}
+        assert abs(sum(by_episode.get(i, 0.0) for i in range(start, start + group))) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "more", [{"scaffolds": [{"memory": ["none", "base", "summary"]}]}, {"agent": {"scope": "run"}}], ids=["3", "run"]
+)
+def test_groups_that_cannot_be_dealt_out(tmp_path: Path, more: dict[str, Any]) -> None:
+    with pytest.raises(SpecError, match=r"scaffolds: .* takes a multiple of them"):
+        trainer(tmp_path, **{"scaffolds": [{"memory": ["none", "base"]}], **more})
+
+
+def test_what_is_held_out_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match=r"held_out: .* is in the mixture"):
+        trainer(tmp_path, scaffolds=[{"memory": ["none", "base"]}], held_out=[{"memory": "base"}])
+    with pytest.raises(SpecError, match=r"held_out is .* there is one scaffold"):
+        trainer(tmp_path, held_out=[{"memory": "base"}])

@@ -1,0 +1,95 @@
+"""The diagonal of a transfer matrix against the rest, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from eval.transfer import at_home, contrasts, diagonal
+
+HOME = {"a": "x", "b": "y"}
+
+
+def cells(
+    a: list[tuple[float, float]], b: list[tuple[float, float]]
+) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+    """Two arms, home x and y; each run is (value in x, value in y), on one task."""
+    named = {"a": a, "b": b}
+    return {
+        arm: {str(i): {"x": {"t": x}, "y": {"t": y}} for i, (x, y) in enumerate(runs)} for arm, runs in named.items()
+    }
+
+
+def test_the_diagonal_over_training_runs_by_hand() -> None:
+    played = cells([(5, 1), (6, 1), (7, 1)], [(4, 3), (4, 5), (4, 7)])
+    # Contrasts: of a 4, 5, 6 (mean 5, variance 1), of b -1, 1, 3 (mean 1, variance 4).
+    assert [run["t"] for run in contrasts(played, HOME)["a"].values()] == [4, 5, 6]
+    assert [run["t"] for run in contrasts(played, HOME)["b"].values()] == [-1, 1, 3]
+    found = diagonal(played, HOME)
+    # (5 + 1) / 2 = 3. Error: sqrt(1/4 (1/3 + 4/3)) = sqrt(5/12) = .6455, t = 4.6476.
+    # Satterthwaite: (5/12)^2 / ((1/12)^2 / 2 + (1/3)^2 / 2) = (25/144) / (17/288) = 50/17 = 2.941 degrees of freedom.
+    from scipy import stats
+
+    half = stats.t.ppf(0.975, 50 / 17) * math.sqrt(5 / 12)
+    assert found.estimate.mean == pytest.approx(3)
+    assert (found.estimate.low, found.estimate.high) == pytest.approx((3 - half, 3 + half))
+    assert found.estimate.p == pytest.approx(2 * stats.t.sf(3 / math.sqrt(5 / 12), 50 / 17))
+    assert 2.07 < half < 2.09 and 0.018 < found.estimate.p < 0.022  # t tables: 3.18 at 3 degrees, 4.30 at 2
+    assert (found.estimate.n, found.estimate.unit, found.estimate.note) == (6, "run", "")
+
+
+def test_neither_easy_scaffolds_nor_good_learners_are_a_diagonal() -> None:
+    # Value = how well the arm has learnt + how easy the scaffold is (y: 10 more), and nothing else.
+    found = diagonal(cells([(1, 11), (2, 12), (3, 13)], [(7, 17), (7, 17), (8, 18)]), HOME)
+    assert found.estimate.mean == pytest.approx(0) and found.estimate.p == 1 and found.estimate.tie()
+    assert found.permutation == 1
+
+
+def test_fewer_than_three_runs_speak_of_their_checkpoints_only() -> None:
+    two = cells([(5, 1), (6, 1)], [(4, 3), (4, 5), (4, 7)])
+    for runs in two.values():
+        for of in runs.values():
+            of["x"]["u"], of["y"]["u"] = of["x"]["t"] + 1, of["y"]["t"]
+    found = diagonal(two, HOME).estimate
+    # Task t: (4.5 + 1) / 2 = 2.75. Task u: x is 1 more, so a's contrast rises and b's falls by 1: 2.75 again.
+    assert (found.mean, found.n, found.unit, found.note) == (2.75, 2, "seed", "this checkpoint only")
+    assert found.p == 0.5  # of four flips of two equal numbers, two are as far
+
+
+def test_all_assignments_of_homes_are_counted() -> None:
+    arms = {"a": "x", "b": "y", "c": "z"}
+    grid = {"a": (3, 0, 0), "b": (0, 3, 0), "c": (0, 0, 3)}
+    played = {
+        arm: {str(i): dict(zip("xyz", ({"t": float(v)} for v in row), strict=True)) for i in range(3)}
+        for arm, row in grid.items()
+    }
+    found = diagonal(played, arms)
+    # Rows less their means: 2 on the diagonal, -1 elsewhere. Six assignments: 6 once (all at home), 0 three times (one
+    # at home: 2 - 1 - 1), -3 twice: only the real one is as far from 0.
+    assert (found.permutation, found.assignments) == (pytest.approx(1 / 6), 6)
+    assert found.estimate.mean == 3 and found.estimate.p == 0  # no run varies
+
+
+def test_arms_of_one_home_count_together_once() -> None:
+    played = cells([(4, 0)] * 3, [(0, 2)] * 3)
+    played["c"] = {str(i): {"x": {"t": 2.0}, "y": {"t": 0.0}} for i in range(3)}
+    # Home x: contrasts 4 (a) and 2 (c), mean 3; home y: 2. Homes weigh the same: 2.5.
+    assert diagonal(played, {**HOME, "c": "x"}).estimate.mean == 2.5
+
+
+def test_what_is_compared_in_one_scaffold() -> None:
+    own = at_home(cells([(5, 1), (6, 1), (7, 1)], [(4, 3), (4, 5), (4, 7)]), HOME)
+    assert own["x"].mean == pytest.approx(2) and own["y"].mean == pytest.approx(4)  # 6 - 4, and 5 - 1
+    assert own["x"].unit == own["y"].unit == "run"
+
+
+def test_tasks_that_a_cell_lacks_are_left_out_and_holes_refused() -> None:
+    played = cells([(5, 1)] * 3, [(4, 3)] * 3)
+    played["a"]["0"]["x"]["only here"] = 100.0
+    assert diagonal(played, HOME).estimate.mean == pytest.approx((4 - 1) / 2)
+    with pytest.raises(ValueError, match="needs two scaffolds"):
+        diagonal({"a": played["a"]}, HOME)
+    del played["b"]["1"]["y"]
+    with pytest.raises(ValueError, match="run 1 of b has no value in y"):
+        diagonal(played, HOME)
