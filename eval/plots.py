@@ -54,45 +54,6 @@ def reward_curve(
     return True
 
 
-def learning_curves(
-    runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]],
-    path: str | Path,
-    *,
-    key: str = "reward",
-    title: str = "",
-    unit: str = "",
-) -> bool:
-    """Draw ``key`` over ``step`` for several methods, each trained with several seeds.
-
-    Args:
-        runs: method -> runs -> rows of ``metrics.jsonl``. Thin lines are runs, the thick one their mean over the steps
-            that all have.
-
-    Returns:
-        Whether there was anything to draw.
-    """
-    figure, axes = _figure(6.4, 4.0)
-    drawn = False
-    for number, (method, members) in enumerate(runs.items()):
-        curves = [{r["step"]: float(r[key]) for r in rows if r.get(key) is not None} for rows in members]
-        curves = [c for c in curves if c]
-        color = f"C{number}"
-        for curve in curves:
-            axes.plot(list(curve), list(curve.values()), color=color, linewidth=0.7, alpha=0.4)
-            drawn = True
-        if curves:
-            common = sorted(set.intersection(*map(set, curves)))
-            means = [math.fsum(c[step] for c in curves) / len(curves) for step in common]
-            axes.plot(common, means, color=color, linewidth=2, label=f"{method}, mean of {len(curves)} runs")
-    if not drawn:
-        return False
-    axes.plot([], [], color="gray", linewidth=0.7, alpha=0.6, label="thin: one run each")
-    axes.legend(fontsize=8)
-    _label(axes, key, title, unit)
-    _save(figure, path)
-    return True
-
-
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     """Mean of the last ``window`` values (of fewer at the start); same length as ``values``."""
     sums = np.cumsum(np.concatenate([[0.0], values]))

@@ -21,8 +21,8 @@ from trainers.losses import loss
 
 OURS = {
     "model": "model adapter actor_adapter actor_temperature lora_r lora_alpha lora_targets lora_layers",
-    "agent and world": "agent environment scaffolds held_out train_tasks memory_carry start_memory retries "
-    "env_timeout_s rollout_concurrency batching",
+    "agent and world": "agent environment scaffolds held_out scaffold_groups train_tasks memory_carry start_memory "
+    "retries env_timeout_s rollout_concurrency batching",
     "credit and loss": "train_calls train_credits rewards estimator reference gamma gigpo_weight skip_zero_variance "
     "write_credit write_calls write_rerolls write_points "
     "normalize overlong overlong_ends mask_truncated packing tokens_per_forward",

@@ -39,6 +39,7 @@ NAMES: dict[str, Collection[str]] = {
     "overlong_ends": ("context", "budget", "max_steps", "truncated"),
     "train_credits": ("executed", "explored", "aux"),
     "memory_carry": ("first", "best"),
+    "scaffold_groups": ("across", "within"),
     "packing": ("tree", "padded"),
     "reference": ("initial", "base"),
     "batching": ("auto", *get_args(Batching)),
@@ -118,7 +119,8 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
     for spec in specs:
         yield from _trainable(spec, train)
     over = any(spec.scope == "run" for spec in specs) or config.write_credit != "episode"
-    if config.scaffolds is not None and (over or config.num_generations % len(specs)):
+    odd = config.scaffold_groups == "across" and config.num_generations % len(specs)
+    if config.scaffolds is not None and (over or odd):
         yield (
             f"scaffolds: the {config.num_generations} rollouts of a group are dealt out over {len(specs)} scaffolds; "
             "that takes a multiple of them as num_generations, `scope: episode` and `write_credit: episode`"

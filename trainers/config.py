@@ -45,8 +45,9 @@ class ScaffoldConfig(GRPOConfig):
         agent: the agent spec: a mapping, or a path to a YAML file.
         environment: `{name: ..., options: {...}}`: the world and its `gymnasium.make` arguments.
         scaffolds: several agents instead of one: entries over `agent`, with lists of alternatives
-            (`agentspec.mixture`). A warm start plays its expert through all of them; in training the rollouts of each
-            group are dealt out over them.
+            (`agentspec.mixture`). A warm start plays its expert through all of them.
+        scaffold_groups: in training with `scaffolds`: rollouts of a group are dealt out `across` them, or each group is
+            played `within` one (that of its task's seed).
         held_out: agents that must not be among `scaffolds`, by what they name.
         train_tasks: number of distinct training tasks (seeds `0 .. train_tasks - 1`).
         eval_tasks: number of held-out tasks (seeds `20000 ..`) for evaluation after training.
@@ -105,6 +106,7 @@ class ScaffoldConfig(GRPOConfig):
     environment: dict[str, Any] | str | None = None
     scaffolds: list[Any] | str | None = None
     held_out: list[Any] | str | None = None
+    scaffold_groups: str = "across"
     train_tasks: int = 64
     eval_tasks: int = 16
     train_calls: list[str] = field(default_factory=lambda: ["reasoning.*"])

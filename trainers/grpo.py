@@ -169,12 +169,13 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
     def _play(self, jobs: Sequence[Job], spec: AgentSpec | None = None) -> list[ScoredEpisode]:
         """One episode per job, in order, those that failed among them; `spec`: another than the training scaffold.
 
-        Where there are several of these (`scaffolds`), rollout i of a task is played in the i-th, from the first again.
+        Where there are several of these (`scaffolds`), a rollout's or a task's number says in which one it is played.
         """
-        specs = [spec] if spec else self.args.mixture
+        specs, across = [spec] if spec else self.args.mixture, self.args.scaffold_groups == "across"
+        places = [(job.rollout if across else job.task.seed) % len(specs) for job in jobs]
         played: dict[int, ScoredEpisode] = {}
         for number, one in enumerate(specs):
-            if mine := [i for i, job in enumerate(jobs) if job.rollout % len(specs) == number]:
+            if mine := [i for i, place in enumerate(places) if place == number]:
                 runner, share = self._runner(one), [jobs[i] for i in mine]
                 played |= zip(mine, collect(runner, share, self.rewards_used, retries=self.args.retries), strict=True)
         return [played[i] for i in range(len(jobs))]

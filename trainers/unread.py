@@ -57,7 +57,7 @@ def unread(config: ScaffoldConfig) -> dict[str, str]:
         (not config.adapter, f"lora_r {SHAPE}", "beside adapter, whose own shape is trained; set `adapter: ''`"),
         (config.lora_r or config.adapter, SHAPE, "lora_r 0 trains all weights; give it a rank"),
         (reflects, "actor_adapter actor_temperature", f"no actor is frozen without `reflection: {REFLECTION}`"),
-        (config.scaffolds is not None, "held_out", "there is one scaffold; set `scaffolds`"),
+        (config.scaffolds is not None, "held_out scaffold_groups", "there is one scaffold; set `scaffolds`"),
         (carries, "memory_carry", "no memory outlives its episode; set `agent: {scope: run}`"),
         (config.validates, "validation_tasks validation_specs", "nothing is validated; set `eval_strategy: steps`"),
         (vllm, f"vllm_mode vllm_batch_invariant vllm_importance_sampling_correction {WEIGHTED}", without),

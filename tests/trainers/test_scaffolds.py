@@ -44,12 +44,14 @@ def test_three_updates_inside_a_scaffold(tmp_path: Path, spec: dict[str, Any], e
     assert all(r.trained == r.denominator > 0 for r in receipts)
 
 
-def test_a_group_over_two_scaffolds(tmp_path: Path) -> None:
-    """Rollouts of a task are dealt out; they are one group all the same, and the audit makes the same of them."""
+@pytest.mark.parametrize("groups", ["across", "within"])
+def test_a_group_over_two_scaffolds(tmp_path: Path, groups: str) -> None:
+    """Rollouts or tasks are dealt out; a task's are one group all the same, and the audit makes the same of them."""
     run = trainer(
         tmp_path,
         agent={"sampling": {"max_tokens": 6}},
         scaffolds=[{"memory": ["none", "base"], "layout": "snapshot"}],
+        scaffold_groups=groups,
         max_steps=2,
         save_steps=2,
     )
@@ -57,8 +59,8 @@ def test_a_group_over_two_scaffolds(tmp_path: Path) -> None:
     receipts = list(audit(tmp_path))
     assert [r.violations for r in receipts] == [[], []]
     group = run.args.num_generations
-    played = [t.spec["memory"] for t in run.last_episodes]
-    assert played == ["none", "base"] * (len(played) // 2) and group % 2 == 0
+    played = [(t.rollout if groups == "across" else t.task.seed, t.spec["memory"]) for t in run.last_episodes]
+    assert all(memory == ("none", "base")[number % 2] for number, memory in played) and group == 2
     rounds = RunLog(tmp_path).read("updates.jsonl")
     for start in range(0, len(played), group):  # the advantage of a group's episodes, over both scaffolds, sums to 0
         by_episode = {row["episode"]: row["advantage"] for row in rounds[-1]["rows"]}
