@@ -168,7 +168,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
     given = {**data, "scaffolds": scaffolds, "arms": arms}
     check_types("a study", Study, {k: v for k, v in given.items() if k not in ("scaffolds", "arms")})
     study = Study(**given)
-    check_types("evaluation", Settings, {k: v for k, v in study.evaluation.items() if k != "backend"})
+    _check_evaluation(study.evaluation)
     known = [START, *arms, *study.references]
     listed = [("table", name) for name in study.table.values()]
     for name, pair in study.compare.items():
@@ -181,6 +181,14 @@ def read_study(data: Mapping[str, Any]) -> Study:
     if len(set(study.seeds)) < len(study.seeds) or not study.seeds or study.tasks < 1:
         raise SpecError(f"a study needs different seeds and a task, got seeds {study.seeds}, tasks {study.tasks}")
     return study
+
+
+def _check_evaluation(given: Mapping[str, Any]) -> None:
+    allowed = ["backend", *(item.name for item in fields(Settings) if item.name not in ("prices", "limits"))]
+    for key in given:
+        if key not in allowed:
+            raise SpecError(f"unknown key {key!r} in evaluation{suggest(str(key), allowed)}")
+    check_types("evaluation", Settings, {k: v for k, v in given.items() if k != "backend"})
 
 
 def _arm(name: str, item: Any, scaffolds: Mapping[str, AgentSpec]) -> Arm:

@@ -10,8 +10,10 @@ import pytest
 pytest.importorskip("trl")
 
 from agentspec.registry import SpecError
+from tests.trainers.builders import CPU_RUN
 from tests.trainers.test_resume import trainer
 from trainers.audit import audit
+from trainers.config import ScaffoldConfig
 from trainers.runlog import RunLog
 
 SPECS: list[dict[str, Any]] = [
@@ -76,7 +78,13 @@ def test_groups_that_cannot_be_dealt_out(tmp_path: Path, more: dict[str, Any]) -
 
 
 def test_what_is_held_out_is_refused(tmp_path: Path) -> None:
+    base: dict[str, Any] = {
+        "output_dir": str(tmp_path),
+        "num_generations": 2,
+        "held_out": [{"memory": "base"}],
+        **CPU_RUN,
+    }
     with pytest.raises(SpecError, match=r"held_out: .* is in the mixture"):
-        trainer(tmp_path, scaffolds=[{"memory": ["none", "base"]}], held_out=[{"memory": "base"}])
+        ScaffoldConfig(**base, scaffolds=[{"memory": ["none", "base"]}]).check()
     with pytest.raises(SpecError, match=r"held_out is .* there is one scaffold"):
-        trainer(tmp_path, held_out=[{"memory": "base"}])
+        ScaffoldConfig(**base).check()
