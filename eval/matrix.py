@@ -65,6 +65,7 @@ def evaluate(
     executor: str = "local",
     workers: int = 1,
     address: str = "",
+    twins: bool = False,
     on_row: OnRow | None = None,
     observer: Observer | None = None,
     **changes: Any,
@@ -84,6 +85,8 @@ def evaluate(
         make_llm: policy -> loaded backend; default: what the policy says. Called once per policy that has to play.
         make_env: task -> environment.
         executor: `local`, or `ray`: `workers` processes, here or on the cluster at `address`, with one model each.
+        twins: training runs of a policy may have the same weights (they have learnt nothing); else that is refused,
+            since who lists one run twice would count it as two.
         on_row: told of every episode that is played now.
         observer: told of more.
 
@@ -94,7 +97,7 @@ def evaluate(
     """
     settings = replace(settings or Settings(), **changes)
     sets = task_sets(tasks)
-    _check(policies, specs, settings, executor)
+    _check(policies, specs, settings, executor, twins)
     if executor != "ray" and (workers != 1 or address):
         raise SpecError("workers and address are those of Ray: give executor: ray (--executor ray), or leave them out")
     seen = observer or Observer()
@@ -237,7 +240,9 @@ def _missing(cell: Cell, store: Store, settings: Settings) -> list[str]:
     return keys
 
 
-def _check(policies: Sequence[Policy], specs: Mapping[str, AgentSpec], settings: Settings, executor: str) -> None:
+def _check(
+    policies: Sequence[Policy], specs: Mapping[str, AgentSpec], settings: Settings, executor: str, twins: bool
+) -> None:
     if executor not in ("local", "ray"):
         raise SpecError(f"unknown executor {executor!r}{suggest(executor, ('local', 'ray'))}")
     if not policies or not specs:
@@ -247,7 +252,7 @@ def _check(policies: Sequence[Policy], specs: Mapping[str, AgentSpec], settings:
     twice = sorted({name for name, run in names if names.count((name, run)) > 1})
     if twice:
         raise SpecError(f"two policies are called {', '.join(twice)}; give each its own name (NAME=MODEL)")
-    for policy in dict.fromkeys(name for name, _ in names):
+    for policy in () if twins else dict.fromkeys(name for name, _ in names):
         same = [p for p in policies if p.name == policy]
         if len({json_line(p.identity()) for p in same}) < len(same):
             runs = ", ".join(p.run for p in same)

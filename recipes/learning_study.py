@@ -33,7 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
     parser.add_argument("--config", metavar="FILE", help="the study, or the name of one that ships")
     parser.add_argument("--out", metavar="DIR", help="folder of runs and report (default: the study's `out`)")
-    parser.add_argument("--dry-run", action="store_true", help="print runs, episodes and estimated hours; do nothing")
+    parser.add_argument("--dry-run", action="store_true", help="print runs, episodes and estimated hours")
     parser.add_argument("--no-train", action="store_true", help="evaluate the runs that have ended")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="training runs side by side, one thread each")
     options = parser.parse_args()
@@ -112,7 +112,7 @@ def evaluate_all(study: Study, configs: Mapping[str, Any]) -> None:
     start = str(resolve_adapter(config.adapter)) if config.adapter else ""
     policies = study.policies(config.model, start, lora=bool(config.lora_r or start))
     tasks = held_out(study, config)
-    evaluate(policies, study.scaffolds, tasks, out=out, settings=study.settings, observer=LiveTable())
+    evaluate(policies, study.scaffolds, tasks, out=out, settings=study.settings, twins=True, observer=LiveTable())
     append_lines(out / "costs.jsonl", {"what": "evaluation", "cpu_s": round(cpu_seconds() - before, 1)})
     rollouts = {name: c.generation_batch_size for name, c in configs.items()}
     write_atomic(out / "study.json", study.record(rollouts, {run: receipt(study.folder(*run)) for run in study.ended}))

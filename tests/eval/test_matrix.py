@@ -336,3 +336,7 @@ def test_one_checkpoint_given_twice_is_not_two_training_runs(tmp_path: Path) -> 
     runs = [Policy("trained", model, run=str(i)) for i, model in enumerate(("m", "n", "m"))]
     with pytest.raises(SpecError, match=r"'trained': two of its training runs \(0, 1, 2\) have the same weights"):
         play(tmp_path, policies=runs)
+    # Who knows that they are several runs, which have learnt nothing, counts each: the episodes are kept once.
+    rows, _ = play(tmp_path, policies=runs, specs={"plain": PLAIN}, twins=True)
+    keys = {run: [row["key"] for row in rows if row["run"] == run] for run in "012"}
+    assert keys["0"] == keys["2"] != keys["1"] and all(row["status"] == "completed" for row in rows)

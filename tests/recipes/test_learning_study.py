@@ -77,11 +77,12 @@ def test_two_scaffolds_and_one_update_end_to_end(
 ) -> None:
     """Every run a process of its own, as for real."""
     out = tmp_path / "out"
-    asked = {"table": {"Non-RL": "start", "GRPO": "none"}, "compare": {"notes": ["none", "sheet"]}}
+    asked = {"table": {"Non-RL": "start", "GRPO": "none"}, "compare": {"notes": ["none", "sheet"]}, "rates": {}}
     config = written(tmp_path, study(base, out, **asked))
     run(monkeypatch, "--config", config, "--dry-run")
     said = capsys.readouterr().out
     assert "2 training runs" in said and "3 policies x 2 scaffolds x 2 episodes = 12 episodes" in said
+    assert "rates (measured just now, from two prompts): read" in said
     assert not (out / "runs").exists() and not (out / "results.jsonl").exists()
     run(monkeypatch, "--config", config, "--jobs", "2")
     text = (out / "report" / "report.md").read_text()
@@ -156,11 +157,11 @@ def test_a_study_killed_after_one_arm_goes_on_where_it_stopped(
 
 
 def test_a_missing_study_is_told_with_those_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SpecError, match=r"give --config FILE.*transfer_cpu, transfer_minigrid_cpu"):
+    with pytest.raises(SpecError, match=r"give --config FILE.*transfer_cpu, .*transfer_minigrid_cpu"):
         run(monkeypatch)
 
 
-@pytest.mark.parametrize("name", ["transfer_cpu", "transfer_minigrid_cpu", "transfer_qwen3_4b"])
+@pytest.mark.parametrize("name", ["transfer_cpu", "transfer_groups_cpu", "transfer_minigrid_cpu", "transfer_qwen3_4b"])
 def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
     from eval.study import read_study
     from eval.study.cost import Rates
