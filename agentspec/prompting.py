@@ -68,6 +68,7 @@ def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcri
     Steps that the transcript or the conversation tells are not told again by a memory (items of kind `step` and
     `failure`, one for each of the newest steps); of a conversation's, failures stay whose reason it does not give.
     """
+    services.context.transcript = transcript
     if transcript:
         recall = Recall(tuple(item for item in recall.items if item.kind not in STEPS))
         transcript = TRANSCRIPT.format(text=transcript)

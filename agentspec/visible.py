@@ -79,7 +79,7 @@ def undressed(text: str) -> str:
     # Quotes within the strings of JSON are none of its own.
     text = text if _OBJECT.search(text) else text.translate(_QUOTES)
     text = _MINUS.sub("-", text.translate(_SIGNS)).replace("\\_", "_")
-    text = _LATEX.sub(r"\1", _STRUCK.sub("", _ASIDE.sub("", _PRINT.sub(r"\1", text))))
+    text = _LATEX.sub(r"\1", _STRUCK.sub("", _PRINT.sub(r"\1", _ASIDE.sub("", text) if "</" in text else text)))
     # The cells of a table are a list: several actions in it leave open which one is meant.
     text = _ROW.sub(lambda m: "\n".join(f"• {c.strip()}" for c in m[1].split("|")), _RULE.sub("", _TAG.sub("", text)))
     text = _AS_LABEL.sub(lambda m: f"\nAction: {m.group(2).strip()}\n", text)

@@ -44,7 +44,8 @@ FORMAT_MENU = (
     "listed actions, word for word."
 )
 ACKNOWLEDGED = "OK."
-STOP = ("\nObservation:", "Observation:")
+STOP = ("\nObservation:",)
+"""Not where an answer begins with it: a model that first says what it sees would be stopped before its first word."""
 
 
 class ReAct:
@@ -112,7 +113,9 @@ class ReAct:
                 return self._decision(Acted(reading, call, tuple(calls)), words)
             reply = ACKNOWLEDGED
             meant = isinstance(reading.action, ActionError) and (
-                reading.explicit or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                reading.explicit
+                or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                or not visible(call.text)[0]  # nothing is no thought
             )
             if meant and retries and not schema.choices:
                 assert isinstance(reading.action, ActionError)

@@ -58,6 +58,8 @@ async def rate(
         prompts = [with_request(messages, IN_WORDS) for messages in prompts]
     ratings: list[float | None] = []
     for call in await meter.ask_all([Ask("value", messages, sampling) for messages in prompts]):
-        found = [n for n in (last_number(c.text, RATINGS) for c in call.completions) if n is not None]
+        # Of an answer that was cut off the last number is any number.
+        whole = [c for c in call.completions if constrained or c.finish_reason != "length"]
+        found = [n for n in (last_number(c.text, RATINGS) for c in whole) if n is not None]
         ratings.append(sum(found) / len(found) / RATINGS[-1] if found else None)
     return ratings
