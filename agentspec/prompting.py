@@ -26,6 +26,7 @@ from agentspec.llm.base import Message, assistant, user
 from agentspec.reading import Reading, read
 from agentspec.registry import SpecError
 from agentspec.services import Services
+from agentspec.tokens import excerpt
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, Sampled
 from agentspec.visible import visible
 
@@ -154,6 +155,8 @@ class Step:
 def course(steps: Sequence[Step], budget: int, services: Services) -> str:
     """Numbered steps. Every action and thought stays; what was observed shares what they leave of `budget` tokens.
 
+    Of a long observation every paragraph is told in part, and a mark stands where it was cut.
+
     The newest observation gets as much as it needs of half the room, older ones equal parts of the rest.
     """
     bare = [_step(i, step, "") for i, step in enumerate(steps, 1)]
@@ -162,7 +165,7 @@ def course(steps: Sequence[Step], budget: int, services: Services) -> str:
     waiting = [i for i in reversed(range(len(steps))) if steps[i].seen]
     for number, i in enumerate(waiting):
         share = left // 2 if number == 0 and len(waiting) > 1 else left // (len(waiting) - number)
-        text = clip(" ".join(steps[i].seen.split()), share, services) if share > 0 else ""
+        text = excerpt(steps[i].seen, share, services.llm.count_tokens) if share > 0 else ""
         shown[i] = text
         left -= services.llm.count_tokens(text)
     return "\n".join(_step(i, step, seen) for i, (step, seen) in enumerate(zip(steps, shown, strict=True), 1))

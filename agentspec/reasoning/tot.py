@@ -256,7 +256,7 @@ class TreeOfThoughts(Stateless):
         form = AS_WORDS if menu and node.depth else AS_CALLS
         if menu and not node.depth:
             sampling = {"n": self.thoughts, "choices": menu, **self.sampling}
-            return Ask("propose", with_request(search.base, SAMPLE.format(form="")), sampling, "explored")
+            return Ask("propose", with_request(search.base, SAMPLE.format(form="").strip()), sampling, "explored")
         if self.propose:
             request = self._course(node) + PROPOSE.format(k=self.thoughts, form=form)
             return Ask("propose", with_request(search.base, request), self.sampling, "explored")

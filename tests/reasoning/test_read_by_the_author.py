@@ -8,6 +8,7 @@ from agentspec.episode import Job, Runner
 from agentspec.llm.base import Request
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.reasoning.plan_text import goals_of, says_done
+from agentspec.reasoning.search.judge import last_amount, last_number, last_word
 from agentspec.reflection.trials import _steps_within
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
@@ -141,3 +142,36 @@ def test_a_reflector_is_told_how_the_trial_ended() -> None:
 
     assert "It was cut off after step 3." in told(3, "TURN_LEFT()")
     assert "It ended with step 1, without success." in told(3, "TOGGLE()")
+
+
+def test_a_judge_sees_first_what_a_tried_action_did_and_something_of_every_paragraph() -> None:
+    """A refused action changes nothing that a clipped observation shows; why it was refused stands at its end."""
+    asked: list[Request] = []
+
+    def script(request: Request) -> str:
+        asked.append(request)
+        return "Rating: 2" if request.tag.purpose == "value" else "Thought: so.\nAction: RENT_CAR()"
+
+    small = {"num_iterations": 1, "n_generate_sample": 1, "root_samples": 1, "path_tokens": 400}
+    spec = AgentSpec.from_data({"reasoning": {"name": "lats", "preset": "rl", **small}})
+    Runner(spec, ScriptedLLM(script), max_steps=1).run([Job(Task("deliverybench", 0, {"size": "tiny"}))])
+    course = next(r for r in asked if r.tag.purpose == "value").messages[-1].text.partition("Steps tried")[2]
+    assert "-> there is no car rental within 5m" in course
+    assert "Your orders: none" in course and "Around you" in course and " ..." in course
+
+
+@pytest.mark.parametrize(
+    ("answer", "rating"),
+    [("Rating: 8 (of 1-10)", 8), ("**Rating:** 7\nThere are 3 orders.", 7), ("The best one is 2, not 3.", 2), ("4", 4)],
+)
+def test_the_number_that_is_called_the_rating_counts(answer: str, rating: int) -> None:
+    assert last_number(answer, range(1, 11)) == rating
+
+
+def test_a_denied_word_is_no_judgement_and_a_thousand_is_one() -> None:
+    values = {"sure": 20.0, "likely": 1.0, "impossible": 0.001}
+    assert last_word("It is likely, but I am not sure.", values) == 1.0
+    assert last_word("That isn't impossible.", values) is None
+    assert last_word("Not sure at first; but yes: sure", values) == 20.0
+    assert last_amount("Estimate: $1,200", "estimate") == 1200.0
+    assert last_amount("Estimate: 12,50", "estimate") == 12.5
