@@ -27,8 +27,8 @@ from agentspec import literals, shapes
 from agentspec.literals import known_name, parse_call, scan_call
 from agentspec.remarks import chooses_later, corrected, is_meant, only_spoken_of, stands
 from agentspec.types import Action, ActionError, ActionSchema
-from agentspec.values import CALL, DRESS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, squeeze
-from agentspec.visible import undressed, visible
+from agentspec.values import CALL, DRESS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, same_call, squeeze
+from agentspec.visible import bounded, undressed, visible
 
 _LABEL = re.compile(
     r"^[ \t>#*_\-•\"'`{]{0,40}(?:\(?\d{1,4}[.):][ \t]*)?[\"'*_` \t]{0,40}"
@@ -39,6 +39,7 @@ _LABEL = re.compile(
 )
 _HEADING = re.compile(r"^[ \t]*#+[ \t]*(?:final |next )?action[ \t:]*$", re.IGNORECASE | re.MULTILINE)
 _MID_LABEL = re.compile(r"\b(?:final |next )?action[ \t*_`]*:", re.IGNORECASE)
+_FINAL = re.compile(r"^[ \t>#*_\-•]{0,40}final[ \t]+(?:action|answer)[ \t*_`]*:[ \t*_]*", re.IGNORECASE | re.MULTILINE)
 _TURN = re.compile(
     r"^\W{0,4}(?:observation|user|human|environment|system|result)[ \t]*\d*[ \t*_]*:", re.I | re.MULTILINE
 )
@@ -53,9 +54,6 @@ _WEAK_LABEL = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 """What may introduce an action, if one follows."""
-
-LONGEST = 50_000
-"""Signs of an answer that are read: of a longer one the beginning and the end, half each."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,10 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     if plain_action is not None:
         return Reading(plain_action, explicit=text in schema.choices)
     shown, open_block = visible(text)
-    plain = undressed(_bounded(shown))
+    plain = undressed(bounded(shown))
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
     if isinstance(reading.action, Action):
-        plan = shapes.plan_of(_bounded(shown))
+        plan = shapes.plan_of(bounded(shown))
         return replace(reading, action=replace(reading.action, plan=plan)) if plan else reading
     error = reading.action
     if (cut or open_block) and error.code not in ("PARSE_UNKNOWN", "PARSE_ARGS"):
@@ -156,15 +154,13 @@ class _Reader:
             thought = _thought(self.text[: label.start()])
             value = self.text[label.end() :]
             said = self.values.read(value)
-            if isinstance(said, Action) and not self._stands(value, said):
+            if isinstance(said, Action) and not (self._stands(value, said) and self._is_final(value, said)):
                 said = self._several()
             return Reading(said or self._nothing(first_line(value)), thought, explicit=True)
         self.text = shapes.without_data(self.text)
         found = self._decided() or self._line()
         if found is None:
-            inline = _MID_LABEL.search(self.text)
-            meant = self.values.read(self.text[inline.end() :]) if inline else None
-            found = (meant, inline.start()) if inline and meant else None
+            found = self._inline()
         action: Action | ActionError | None
         action, at = found or (self._mention(), len(self.text))
         if isinstance(action, Action) and chooses_later(self.text[at + len(action.text) :]):
@@ -180,6 +176,18 @@ class _Reader:
         if action.text in self.schema.choices:
             return not corrected(following)
         return stands(rest, following, self.values.other(rest, action))
+
+    def _is_final(self, text: str, action: Action) -> bool:
+        """Whether no "Final action:" after `action` names another one."""
+        final = _FINAL.search(text)
+        said = self.values.read(text[final.end() :]) if final else None
+        return not isinstance(said, Action) or same_call(said, action)
+
+    def _inline(self) -> tuple[Action | ActionError, int] | None:
+        """What stands behind "action:" in the middle of a line, unless it is the last, a wrong or another such one."""
+        labels = [m for m in _MID_LABEL.finditer(self.text) if not only_spoken_of(self.text[: m.end() - 1], "")]
+        meant = self.values.read(self.text[labels[0].end() :]) if labels else None
+        return (meant, labels[0].start()) if meant else None
 
     def _several(self, what: str = "leaves open which action is meant") -> ActionError:
         return ActionError("PARSE_AMBIGUOUS", f"the answer {what}; answer with one of them", self.text)
@@ -285,12 +293,6 @@ def _first_spoken(text: str) -> int:
             return at
         at += len(line)
     return len(text)
-
-
-def _bounded(text: str) -> str:
-    """A text that is too long to be read loses its middle."""
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[:half]}\n{text[-half:]}"
 
 
 def _thought(text: str) -> str:

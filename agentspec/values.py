@@ -116,8 +116,7 @@ class Values:
 
     def other(self, text: str, action: Action) -> bool:
         """Whether `text` holds a call of another action, or of the same one with other arguments."""
-        same = (action.name, action.args, action.kwargs)
-        return any((found.name, found.args, found.kwargs) != same for found, _, _ in self.calls_in(text))
+        return any(not same_call(found, action) for found, _, _ in self.calls_in(text))
 
     def only_calls(self, rest: str) -> bool:
         """Whether `rest` of a line is nothing but further calls, as in `TURN_LEFT(), FORWARD(), FORWARD()`."""
@@ -207,6 +206,11 @@ class Values:
         others = [c for c in self.schema.choices if c != found]
         meant = remarks.is_remark(rest, following, others, labelled=labelled)
         return Action(found, text=found) if meant else None
+
+
+def same_call(one: Action, other: Action) -> bool:
+    """Whether two actions are the same as they were written, apart from spelling."""
+    return (one.name, one.args, one.kwargs) == (other.name, other.args, other.kwargs)
 
 
 def squeeze(text: str) -> str:

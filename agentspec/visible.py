@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import re
 
+LONGEST = 50_000
+"""Signs of an answer that are read: of a longer one the beginning and the end, half each."""
+
 _BLOCKS = "think|thinking|thoughts?|reasoning|reason|reflection|analysis|scratchpad|inner_monologue|antthinking"
 _BLOCK = re.compile(rf"<(/?)(?:\w+:)?(?:{_BLOCKS})\b[^<>]*>|\[(/?)THINK\]|◁(/?)think▷", re.IGNORECASE)
 _OTHER_BLOCKS = (
     (re.compile(r"<\|begin_of_thought\|>"), re.compile(r"<\|end_of_thought\|>")),
+    (re.compile(r"<\|START_THINKING\|>"), re.compile(r"<\|END_THINKING\|>")),
     (re.compile(r"<\|channel>thought\b"), re.compile(r"<channel\|>")),
 )
 _FINAL = re.compile(r"<\|channel\|>\s*final\s*<\|message\|>")
@@ -84,3 +88,9 @@ def undressed(text: str) -> str:
     text = _ROW.sub(lambda m: "\n".join(f"• {c.strip()}" for c in m[1].split("|")), _RULE.sub("", _TAG.sub("", text)))
     text = _AS_LABEL.sub(lambda m: f"\nAction: {m.group(2).strip()}\n", text)
     return _BOXED.sub(lambda m: f"\nAction: {m.group(1)}\n", text).strip()
+
+
+def bounded(text: str) -> str:
+    """A text that is too long to be read loses its middle."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]}\n{text[-half:]}"

@@ -48,6 +48,8 @@ READ = [
     (NATIVE, "Action: [WAIT(60)]", "WAIT(60)"),
     (MENU, "Action: [rent car]", "rent car"),
     (MENU, "Choice: pick up order 3", "pick up order 3"),
+    (NATIVE, "Wrong action: WAIT(60)\nRight action: VIEW_ORDERS()", "VIEW_ORDERS()"),
+    (NATIVE, "<|START_THINKING|>Action: WAIT(5)<|END_THINKING|><|START_RESPONSE|>WAIT(60)<|END_RESPONSE|>", "WAIT(60)"),
     (NATIVE, "PICKUP(orders=[3]) instead of WAIT(60)", "PICKUP(orders=[3])"),
     # several in one answer: the first
     (NATIVE, "[WAIT(60), VIEW_BAG()]", "WAIT(60)"),
@@ -86,6 +88,7 @@ ASKED_AGAIN = [
     # taken back
     (NATIVE, "WAIT(60)\nActually no, VIEW_ORDERS() is better."),
     (NATIVE, "Action: WAIT(60)\nCorrection: Action: VIEW_ORDERS()"),
+    (NATIVE, "Action: WAIT(60)\nFinal Action: VIEW_ORDERS()"),
     (NATIVE, "Action: WAIT(60)\nonly if it is not ready."),
     (MENU, "Action: pick up order 3\nNo wait, rent car"),
     (NATIVE, "WAIT(60) - a bad idea. VIEW_ORDERS() - good."),
