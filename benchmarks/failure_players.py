@@ -142,7 +142,9 @@ def never_charges(at: Seat) -> str:
 def hoards(at: Seat) -> str:
     """Accepts the first offers and then waits."""
     offers = [o["id"] for o in at.state["offers"]]
-    return f"ACCEPT_ORDER({offers[:3]})" if len(at.said) == 1 and offers else "VIEW_ORDERS()" if not at.said else "WAIT(240)"
+    if not at.said:
+        return "VIEW_ORDERS()"
+    return f"ACCEPT_ORDER({offers[:3]})" if len(at.said) == 1 and offers else "WAIT(240)"
 
 
 def strolls(at: Seat) -> str:

@@ -76,6 +76,7 @@ def couriers() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
 
 def grids() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
     """MiniGrid."""
+    two = ("TURN_LEFT()", "TURN_LEFT()")
     invented = ("MOVE_UP()", "GO_TO(goal)", "I turn to the left.", "JUMP()")
     return [
         ("honest", grid("MiniGrid-GoToDoor-5x5-v0"), 1, p.honest, "rule_based"),
@@ -83,7 +84,7 @@ def grids() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
         ("random", grid("MiniGrid-FourRooms-v0"), 3, p.honest, "random"),
         ("straight on", grid("MiniGrid-Empty-16x16-v0"), 4, p.always("FORWARD()"), "rule_based"),
         ("turns", grid("MiniGrid-Empty-6x6-v0"), 5, p.always("TURN_LEFT()"), "rule_based"),
-        ("to and fro", grid("MiniGrid-MultiRoom-N2-S4-v0"), 6, p.always("FORWARD()", "TURN_LEFT()", "TURN_LEFT()"), "rule_based"),
+        ("to and fro", grid("MiniGrid-MultiRoom-N2-S4-v0"), 6, p.always("FORWARD()", *two), "rule_based"),
         ("picks nothing", grid("MiniGrid-Fetch-5x5-N2-v0"), 7, p.sometimes(0.4, "PICK_UP()", "TOGGLE()"), "rule_based"),
         ("grabs", grid("MiniGrid-Fetch-8x8-N3-v0"), 9, p.grabs, "rule_based"),
         ("done early", grid("MiniGrid-GoToObject-6x6-N2-v0"), 10, p.at_steps({2: "DONE()"}), "rule_based"),
@@ -97,7 +98,7 @@ def grids() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
 def rooms() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
     """ALFRED, by native calls and by menu."""
     absent = ('PICKUP("unicorn 1")', 'OPEN("fridge 7")', 'PICKUP("statue 2")', 'TOGGLE_ON("radio 1")')
-    values = ("PICKUP()", 'PUT("mug 1")', "OPEN(3)", "MOVE_AHEAD(5)", 'SLICE()')
+    values = ("PICKUP()", 'PUT("mug 1")', "OPEN(3)", "MOVE_AHEAD(5)", "SLICE()")
     order = ('PUT("apple 1", "fridge 1")', 'OPEN("counter top 1")', 'SLICE("bread 1")', 'CLOSE("cabinet 1")')
     return [
         ("honest", ROOM, 1, p.honest, "rule_based"),
@@ -173,7 +174,10 @@ def _actions(t: Trajectory) -> tuple[str, ...]:
 
 def bare(t: Trajectory) -> Trajectory:
     """The episode without what no rule reads: model calls, turns, traces, the agent."""
-    steps = [replace(s, decision=replace(s.decision, turn=(), trace={}, calls=(), candidates=(), rationale="")) for s in t.transitions]
+    steps = [
+        replace(s, decision=replace(s.decision, turn=(), trace={}, calls=(), candidates=(), rationale=""))
+        for s in t.transitions
+    ]
     return replace(t, spec={}, calls=(), transitions=tuple(steps))
 
 

@@ -11,13 +11,12 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from agentspec.actions import parse_action
 from agentspec.episode import make_env
 from agentspec.failures import LEAVES, Sign, is_failure, leading, signs
-from agentspec.files import jsonable, read_lines
+from agentspec.files import jsonable
 from agentspec.llm.base import LLM, Message, Request
 from agentspec.perception.generic import GenericPerception
 from agentspec.simulator import OBJECTS_IN_INFO
