@@ -30,6 +30,7 @@ COURIER = {"size": "tiny", "shift_hours": 0.5, "max_steps": 18}
 MENU = {"size": "tiny", "shift_hours": 0.3, "max_steps": 14, "observation": "compact", "action_mode": "menu"}
 ROOM, HOME = {"max_steps": 24}, {"max_steps": 24}
 SURROUNDINGS = ("- nearest:", "- ways from here:", "- junctions:", "Around you:", "Last action:", "Last error:")
+OWN = ("Your task", "Find an object")
 ROOM_MENU = {"max_steps": 20, "action_mode": "menu"}
 
 
@@ -211,10 +212,11 @@ def write_texts(episodes: Sequence[Trajectory], folder: Path) -> None:
     for t in episodes:
         told = t.transitions[0].input.instruction
         rules[t.task.env] = max(rules.get(t.task.env, ""), told, key=len)
-    for env, text in rules.items():
-        write_atomic(folder / "worlds" / f"{env}.txt", text + "\n")
+    known = {env: [line for line in text.splitlines() if not line.startswith(OWN)] for env, text in rules.items()}
+    for env, lines in known.items():
+        write_atomic(folder / "worlds" / f"{env}.txt", "\n".join(lines) + "\n")
     for i, t in enumerate(episodes, 1):
-        text = transcript(t, known=rules[t.task.env].splitlines(), left_out=SURROUNDINGS)
+        text = transcript(t, known=known[t.task.env], left_out=SURROUNDINGS)
         write_atomic(folder / "transcripts" / f"{i:03}.txt", f"EPISODE: {i:03}\n{text}\n")
     write_atomic(folder / "LABELS.md", (files("eval") / "data/failures/LABELS.md").read_text(encoding="utf-8"))
 

@@ -13,7 +13,7 @@ from agentspec.types import ActionError, Transition
 
 WHOLE = 700
 """Characters up to which an observation is shown whole; of longer ones, only the lines that are new since the last."""
-LINE, ANSWER, OUTCOME = 240, 300, 200
+LINE, ANSWER, OUTCOME = 420, 300, 200
 """Most characters of a line, of what the agent wrote, and of what the world answered."""
 
 

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
 from agentspec.failures import LEAVES, Sign, in_a_row, is_failure, leading, revisits, signs
 from agentspec.llm.base import Request
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.types import Task
-from eval.failures import (
-    Agreement,
-    Judge,
-    agreement,
-    by_scaffold,
-    diagnose,
-    kappa,
-    paper_shares,
-    read_kind,
-    read_labels,
-    replayed,
-)
+from eval.failures import Judge, by_scaffold, diagnose, paper_shares, read_kind, replayed
 
 FETCH = Task("minigrid", 0, {"level": "MiniGrid-Fetch-5x5-N2-v0"})
 GOTO = Task("minigrid", 0, {"level": "MiniGrid-GoToObject-6x6-N2-v0"})
@@ -115,27 +101,6 @@ def test_shares_per_scaffold_count_failures_only() -> None:
     assert (shares.episodes, shares.failed, shares.share("grounding/spatial/stuck")) == (2, 2, 1.0)
     assert sum(paper_shares("minigrid").values()) == pytest.approx(1.0, abs=0.01)
     assert paper_shares("minigrid").keys() == set(LEAVES) and paper_shares("elsewhere") == {}
-
-
-def test_agreement_by_hand() -> None:
-    a, b = "grounding/spatial/stuck", "grounding/spatial/distance"
-    found = agreement([a, a, b], [a, b, "open"])
-    assert found[a] == Agreement(2, 1, 1) and (found[a].precision, found[a].recall) == (1.0, 0.5)
-    assert found[b] == Agreement(1, 1, 0) and found["all"] == Agreement(3, 2, 1)
-    # Agreement 3 of 4; by chance (2 * 3 + 2 * 1) / 16: (.75 - .5) / (1 - .5).
-    assert kappa(["x", "x", "y", "y"], ["x", "x", "y", "x"]) == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="same items"):
-        kappa(["x"], [])
-
-
-def test_labels_are_read_and_checked(tmp_path: Path) -> None:
-    good = {"task": {"env": "minigrid", "seed": 0}, "actions": ["DONE()"], "label": "grounding/spatial/stuck"}
-    path = tmp_path / "labels.jsonl"
-    path.write_text(json.dumps(good) + "\n")
-    assert read_labels(path) == [good]
-    path.write_text(json.dumps(good | {"label": "lazy"}) + "\n")
-    with pytest.raises(ValueError, match="line 1: 'lazy' is none of"):
-        read_labels(path)
 
 
 def test_positions() -> None:
