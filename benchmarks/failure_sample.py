@@ -130,12 +130,12 @@ def homes() -> list[tuple[str, dict[str, Any], int, p.Act, str]]:
     ]
 
 
-def scripted() -> Iterator[tuple[str, Trajectory]]:
-    """Who played, and the episode."""
+def scripted(later: int = 0) -> Iterator[tuple[str, Trajectory]]:
+    """Who played, and the episode; `later` is added to all seeds."""
     for name in ("deliverybench", "minigrid", "alfred", "robothor"):
         for who, options, seed, act, role in world(name):
-            task = Task(name, seed, options, "test")
-            at = p.seat(task, seed, role)
+            task = Task(name, seed + later, options, "test")
+            at = p.seat(task, seed + later, role)
             yield f"scripted: {who}", played(task, lambda text, info, at=at, act=act: _next(at, act, text, info))
 
 
@@ -190,8 +190,9 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="an evaluation with trajectories of models")
     parser.add_argument("--models", type=int, default=16, help="most episodes out of it (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=15, help="of the order and the choice (default: %(default)s)")
+    parser.add_argument("--later", type=int, default=0, help="added to the seeds of scripted episodes: another sample")
     options = parser.parse_args()
-    found = list(scripted())
+    found = list(scripted(options.later))
     if options.store:
         found += of_models(options.store, options.models, options.seed)
     random.Random(options.seed).shuffle(found)

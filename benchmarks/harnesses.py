@@ -8,7 +8,7 @@ at once, each as a growing conversation. Every harness writes its own full recor
 
 - `agentspec`: `agentspec eval` with the scaffold `direct` in the layout `conversation`;
 - `inspect`: Inspect AI's `eval`, with a solver that plays the world through Inspect's model API (`play_in_inspect`);
-- `verifiers`: `vf-eval` with our taskset and verifiers' own chat loop (`null`, which needs `uv` and starts a process per
+- `verifiers`: `vf-eval` with our taskset and verifiers' own chat loop (`null`; it needs `uv` and starts a process per
   episode: fewer episodes, `SLOW`);
 - `verifiers+agentspec`: `vf-eval` with our scaffold in verifiers' seat.
 
@@ -120,8 +120,9 @@ def agentspec_command(python: str, load: Load, folder: Path) -> list[str]:
         "trajectories": True,
         "concurrency": load.concurrency,
     }
-    (folder / "matrix.yaml").write_text(json.dumps(matrix))
-    return [python, "-m", "agentspec.cli", "eval", "--config", str(folder / "matrix.yaml"), "--out", str(folder / "out")]
+    config = folder / "matrix.yaml"
+    config.write_text(json.dumps(matrix))
+    return [python, "-m", "agentspec.cli", "eval", "--config", str(config), "--out", str(folder / "out")]
 
 
 def inspect_command(python: str, load: Load, folder: Path) -> list[str]:
@@ -232,6 +233,7 @@ def measure(
         "episodes_per_s": more / wall,
         "steps_per_s": more * options.steps / wall,
         "cpu_ms_per_step": 1e3 * cpu / (more * options.steps),
+        "steps_per_cpu_s": more * options.steps / cpu,
         "start_s": few_wall - sizes[0] * wall / more,
     }
 

@@ -1,12 +1,12 @@
 """How far to believe the failure rules: a sample of episodes that two readers labelled without seeing them.
 
-    python -m eval.labels [--answers FILE]
+    python -m eval.labels [DIR] [--answers FILE]
 
 prints, per kind of failure, how the two readers agree (Cohen's kappa), and precision and recall of the rules of
 `agentspec.failures` against what both readers say. The unit is *episode x kind*: present or absent. Where one reader
 marked a kind and the other did not, the pair is disputed and counts for neither precision nor recall; it does count in
 the kappas of the rules against each reader. `--answers` judges a file of labels (of a model, of a reader) in the place
-of the rules. The sample ships (`eval/data/failures`): the trajectories without model calls, who played them
+of the rules. A sample ships (`eval/data/failures`, the default): the trajectories without model calls, who played them
 (`sources.json`), both readers' labels, and what they were told (`LABELS.md`).
 """
 
@@ -189,11 +189,12 @@ def _share(value: float | None) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the summary of the sample that ships."""
+    """Print the summary of a sample."""
     parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("sample", nargs="?", default=SAMPLE, metavar="DIR", help="a labelled sample (default: ours)")
     parser.add_argument("--answers", help="labels to judge in the place of the rules, in the readers' format")
     options = parser.parse_args(arguments)
-    sample = Sample.read()
+    sample = Sample.read(options.sample)
     said = read_labels(options.answers, sample.episodes) if options.answers else sample.rules()
     print(summary(sample, said))
 
