@@ -24,6 +24,7 @@ from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Task
 from benchmarks import failure_players as p
 from eval.failures import played
+from eval.labels import Sample
 from eval.transcripts import transcript
 
 COURIER = {"size": "tiny", "shift_hours": 0.5, "max_steps": 18}
@@ -145,15 +146,15 @@ def _next(at: p.Seat, act: p.Act, text: str, info: Any) -> str:
     return said
 
 
-def of_models(store: Path, most: int, seed: int) -> Iterator[tuple[str, Trajectory]]:
+def of_models(store: Path, most: int, seed: int, taken: set[tuple[str, ...]]) -> Iterator[tuple[str, Trajectory]]:
     """Episodes of models from an evaluation's folder: as even over (policy, scaffold, world) as there are, no two with
-    the same actions."""
+    the same actions, none of `taken`."""
     pools: dict[tuple[str, str, str], list[Trajectory]] = {}
     for path in sorted(store.glob("trajectories/*/*/*.jsonl")):
         for t in read_trajectories(path):
             if t.scorable and t.calls:
                 pools.setdefault((t.policy, path.parent.name, t.task.env), []).append(t)
-    rng, taken = random.Random(seed), set()
+    rng = random.Random(seed)
     for pool in pools.values():
         rng.shuffle(pool)
     names = list(pools)
@@ -190,11 +191,16 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="an evaluation with trajectories of models")
     parser.add_argument("--models", type=int, default=16, help="most episodes out of it (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=15, help="of the order and the choice (default: %(default)s)")
+    parser.add_argument("--scripted", type=int, help="most scripted episodes (default: all)")
+    parser.add_argument("--without", type=Path, help="a sample none of whose episodes is taken again")
     parser.add_argument("--later", type=int, default=0, help="added to the seeds of scripted episodes: another sample")
     options = parser.parse_args()
-    found = list(scripted(options.later))
+    taken = {_actions(t) for t in Sample.episodes_of(options.without).values()} if options.without else set()
+    found = [(who, t) for who, t in scripted(options.later) if _actions(t) not in taken]
+    random.Random(options.seed).shuffle(found)
+    found = found[: options.scripted]
     if options.store:
-        found += of_models(options.store, options.models, options.seed)
+        found += of_models(options.store, options.models, options.seed, taken)
     random.Random(options.seed).shuffle(found)
     packed = gzip.compress("".join(bare(t).to_json() + "\n" for _, t in found).encode(), 9, mtime=0)
     options.to.mkdir(parents=True, exist_ok=True)

@@ -111,11 +111,15 @@ class Sample:
         Raises:
             ValueError: labels of other episodes than those of the sample, or as `read_labels`.
         """
-        at = Path(folder)
+        at, episodes = Path(folder), cls.episodes_of(folder)
         sources = json.loads((at / "sources.json").read_text(encoding="utf-8"))
-        with gzip.open(at / "episodes.jsonl.gz", "rt", encoding="utf-8") as lines:
-            episodes = dict(zip(sources, (Trajectory.from_json(line) for line in lines), strict=True))
         return cls(episodes, sources, *(read_labels(at / f"labels_{r}.jsonl", episodes) for r in "ab"))
+
+    @staticmethod
+    def episodes_of(folder: str | Path) -> dict[str, Trajectory]:
+        """The episodes of a sample, by number from 001, also where nobody has labelled them yet."""
+        with gzip.open(Path(folder) / "episodes.jsonl.gz", "rt", encoding="utf-8") as lines:
+            return {f"{i:03}": Trajectory.from_json(line) for i, line in enumerate(lines, 1)}
 
     def rules(self) -> Labels:
         """What the rules say of each episode."""
