@@ -11,9 +11,10 @@ import pytest
 from agentspec.failures import LEAVES
 from agentspec.types import Task
 from eval.failures import replayed
-from eval.labels import Agreement, agreed, agreement, kappa, kappa_of, read_labels
+from eval.labels import SAMPLE, Agreement, Sample, agreed, agreement, kappa, kappa_of, main, read_labels, summary
 from eval.transcripts import transcript
 
+WORLDS = ("deliverybench", "minigrid", "alfred", "robothor")
 A, B = "grounding/spatial/stuck", "grounding/spatial/distance"
 
 
@@ -80,3 +81,45 @@ def test_a_transcript_shows_what_was_done_and_nothing_that_a_rule_found() -> Non
     long = replayed(courier, ["MOVE(-17m, 45.9m)", "WAIT(60)"])
     shown = (transcript(long, left_out=left_out).count("- junctions:") for left_out in ((), ["- junctions:"]))
     assert [*shown] == [2, 1]
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return Sample.read()
+
+
+def test_the_sample_has_what_it_says(sample: Sample) -> None:
+    worlds = {world: sum(t.task.env == world for t in sample.episodes.values()) for world in WORLDS}
+    assert sum(worlds.values()) == len(sample.episodes) == 67 and min(worlds.values()) >= 8
+    assert sum(who.startswith("model: ") for who in sample.sources.values()) == 16
+    # Every kind was seen by both readers in some episode, and every episode can be judged without an agent.
+    both, _ = agreed(sample.a, sample.b)
+    assert {kind for kinds in both.values() for kind in kinds} == set(LEAVES)
+    assert all(t.scorable and t.transitions and not t.calls for t in sample.episodes.values())
+
+
+def test_precision_recall_and_kappa_of_the_rules(sample: Sample) -> None:
+    """Recomputed from the trajectories and both readers' files; the documentation says the same."""
+    rules = sample.rules()
+    both, disputed = agreed(sample.a, sample.b)
+    found = agreement(both, rules, disputed)
+    whole = sum(found.values(), Agreement(0, 0, 0))
+    # By another way: over pairs of episode and kind that are not disputed.
+    pairs = [(e, kind) for e in sample.episodes for kind in LEAVES if kind not in disputed[e]]
+    assert whole.labelled == sum(kind in both[e] for e, kind in pairs)
+    assert whole.both == sum(kind in both[e] and kind in rules[e] for e, kind in pairs)
+    assert whole.precision is not None and whole.recall is not None
+    assert whole.precision >= 0.9 and whole.recall >= 0.85
+    assert kappa_of(sample.a, sample.b) > 0.8 and kappa_of(rules, sample.a) > 0.8 < kappa_of(rules, sample.b)
+    text = (Path(__file__).parents[2] / "docs/evaluation.md").read_text()
+    assert summary(sample, rules) in text, "run python -m eval.labels and put what it prints into docs/evaluation.md"
+
+
+def test_the_command_prints_it_and_judges_other_answers(
+    sample: Sample, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([])
+    assert capsys.readouterr().out.strip() == summary(sample, sample.rules())
+    main(["--answers", str(SAMPLE / "labels_a.jsonl")])
+    printed = capsys.readouterr().out
+    assert "answers with a 1.00" in printed and printed.count("| 1.00 | 1.00 |") == len(LEAVES) + 1
