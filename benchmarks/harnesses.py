@@ -37,6 +37,7 @@ from typing import Any
 WORLD = "minigrid"
 ANSWER = "turn left"
 SEED = 20_000
+SCAFFOLD = {"reasoning": "direct", "layout": "conversation", "sampling": {"max_tokens": 16}}
 NAMES = ("agentspec", "inspect", "verifiers", "verifiers+agentspec")
 SLOW = {"verifiers": (2, 10)}
 """Few and many episodes of a harness that starts a process per episode."""
@@ -111,11 +112,10 @@ def answer(body: dict[str, Any]) -> tuple[str, bytes]:
 def agentspec_command(python: str, load: Load, folder: Path) -> list[str]:
     """`agentspec eval` of one policy in one scaffold."""
     policy = {"model": "stub", "backend": "openai", "base_url": load.url, "max_concurrency": load.concurrency}
-    scaffold = {"reasoning": "direct", "layout": "conversation", "sampling": {"max_tokens": 16}}
     seeds = f"{SEED}-{SEED + load.episodes - 1}"
     matrix = {
         "policies": {"stub": policy},
-        "scaffolds": {"direct": scaffold},
+        "scaffolds": {"direct": SCAFFOLD},
         "tasks": {"grid": {"env": WORLD, "options": load.options, "seeds": seeds}},
         "trajectories": True,
         "concurrency": load.concurrency,
@@ -133,16 +133,15 @@ def inspect_command(python: str, load: Load, folder: Path) -> list[str]:
 def verifiers_command(python: str, load: Load, folder: Path, *, seat: bool = False) -> list[str]:
     """`vf-eval` with our taskset, and with our scaffold where `seat` says so."""
     program = str(Path(python).with_name("vf-eval"))
-    world = ["--env.taskset.world", WORLD, "--env.taskset.options", json.dumps(load.options)]
+    world = ["agentspec-verifiers", "--env.taskset.world", WORLD, "--env.taskset.options", json.dumps(load.options)]
     client = ["--client.base-url", load.url, "--client.api-key-var", "STUB_KEY", "-m", "stub"]
     run = ["-n", str(load.episodes), "-c", str(load.concurrency), "--no-push", "--no-rich", "-o", str(folder)]
-    tasks = ["--env.taskset.count", str(load.episodes)]
+    command = [program, *world, "--env.taskset.count", str(load.episodes), *client, *run]
     if not seat:
-        return [program, "agentspec-verifiers", *world, *tasks, *client, *run]
-    (folder / "agent.yaml").write_text("{reasoning: direct, layout: conversation, sampling: {max_tokens: 16}}")
-    harness = ["--env.player.harness.id", "agentspec-verifiers"]
+        return command
+    (folder / "agent.yaml").write_text(json.dumps(SCAFFOLD))
     scaffold = ["--env.player.harness.scaffold", str(folder / "agent.yaml")]
-    return [program, "agentspec-verifiers", *world, *tasks, *client, *run, *harness, *scaffold]
+    return [*command, "--env.player.harness.id", "agentspec-verifiers", *scaffold]
 
 
 def play_in_inspect(load: Load, folder: str) -> None:
@@ -201,8 +200,8 @@ def run(command: Sequence[str]) -> tuple[float, float]:
     Raises:
         RuntimeError: it failed.
     """
-    bin_ = str(Path(command[0]).parent)
-    environment = os.environ | {"STUB_KEY": "x", "OPENAI_API_KEY": "x", "PATH": f"{bin_}:{os.environ['PATH']}"}
+    path = f"{Path(command[0]).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"STUB_KEY": "x", "OPENAI_API_KEY": "x", "PATH": path}
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -227,13 +226,11 @@ def measure(
         if calls.value != episodes * options.steps:
             raise RuntimeError(f"{calls.value} calls for {episodes} episodes of {options.steps} steps; no comparison")
     (few_wall, few_cpu), (many_wall, many_cpu) = seconds
-    more = sizes[1] - sizes[0]
-    wall, cpu = many_wall - few_wall, many_cpu - few_cpu
+    more, wall, cpu = sizes[1] - sizes[0], many_wall - few_wall, many_cpu - few_cpu
     return {
         "episodes_per_s": more / wall,
         "steps_per_s": more * options.steps / wall,
         "cpu_ms_per_step": 1e3 * cpu / (more * options.steps),
-        "steps_per_cpu_s": more * options.steps / cpu,
         "start_s": few_wall - sizes[0] * wall / more,
     }
 
@@ -241,10 +238,9 @@ def measure(
 def main() -> None:
     """All harnesses that are installed; a table or JSON."""
     parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--steps", type=int, default=20, help="of an episode (default: %(default)s)")
-    parser.add_argument("--few", type=int, default=8, help="episodes (default: %(default)s)")
-    parser.add_argument("--many", type=int, default=136, help="episodes (default: %(default)s)")
-    parser.add_argument("--concurrency", type=int, default=16, help="episodes at once (default: %(default)s)")
+    sizes = (("--steps", 20, "of an episode"), ("--few", 8, "episodes"), ("--many", 136, "episodes"))
+    for name, default, what in (*sizes, ("--concurrency", 16, "episodes at once")):
+        parser.add_argument(name, type=int, default=default, help=f"{what} (default: %(default)s)")
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES, help="harnesses")
     parser.add_argument("--python", nargs="+", default=[], metavar="NAME=PATH", help="interpreters of harnesses")
     parser.add_argument("--json", action="store_true")
