@@ -278,10 +278,9 @@ def main() -> None:
 def show(found: dict[str, dict[str, float]], skipped: dict[str, str], options: Any) -> None:
     """Print the figures and the ratio of each harness's processor time to ours."""
     ours = found.get("agentspec", {})
-    for row in found.values():
-        if ours:
-            row["times_our_steps_per_s"] = row["steps_per_s"] / ours["steps_per_s"]
-            row["times_our_cpu"] = row["cpu_ms_per_step"] / ours["cpu_ms_per_step"]
+    for row in found.values() if ours else ():
+        row["times_our_steps_per_s"] = row["steps_per_s"] / ours["steps_per_s"]
+        row["times_our_cpu"] = row["cpu_ms_per_step"] / ours["cpu_ms_per_step"]
     what = f"{WORLD}, {options.steps} steps an episode, {options.concurrency} at once, {options.few} -> {options.many}"
     if options.json:
         print(json.dumps({"what": what, "load": os.getloadavg()[0], "harnesses": found, "skipped": skipped}))
