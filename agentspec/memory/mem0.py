@@ -215,6 +215,7 @@ class Mem0Memory:
         self._lines: deque[str] = deque(maxlen=max(1, self.messages + 2 * self.every, self.recent))
         self._unsummarised: list[str] = []
         self._waited = 0
+        self._task = ""  # the instruction that the newest step followed
         self._left = False  # whether an earlier episode left steps
         self._ignored = 0
 
@@ -227,7 +228,7 @@ class Mem0Memory:
         """The nearest memories; first what an earlier episode left is written."""
         if self._left and self._pending:
             self._left = False
-            await self._write(input.instruction)
+            await self._write()
         now = self.services.time()
         found = [(dated(entry, now), score) for entry, score in self.entries.near(input.text, k or self.top)]
         lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
@@ -237,11 +238,12 @@ class Mem0Memory:
         step = Step.of(transition, self.services, self.step_tokens)
         self._pending = [*self._pending, step][-2 * self.every :]
         self._lines.append(step.line)
+        self._task = transition.input.instruction
         self._waited += 1
         if transition.terminated or transition.truncated:
             return
         if self._waited >= self.every:
-            await self._write(transition.input.instruction)
+            await self._write()
         if self.summary_every:
             self._unsummarised.append(step.line)
             if len(self._unsummarised) >= self.summary_every:
@@ -252,11 +254,11 @@ class Mem0Memory:
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
-    async def _write(self, instruction: str) -> None:
+    async def _write(self) -> None:
         """Facts out of the steps that wait, then what becomes of them."""
         self._waited = 0
         parse = json_of({"facts": list[str]}, repairs=self.repairs)
-        answer = await self.services.ask("extract", self._extraction(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
         facts = list(dict.fromkeys(one_line(f) for f in answer.value["facts"] if f.strip()))[: self.max_facts]
@@ -266,8 +268,8 @@ class Mem0Memory:
         if all(done):
             self._pending = []
 
-    def _extraction(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _extraction(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         waiting = [s.line for s in self._pending]
         before = [line for line in self._lines if line not in waiting][-self.messages :] if self.messages else []
         parts = [SUMMARY_SO_FAR.format(summary=self.summary)] if self.summary else []
@@ -332,12 +334,12 @@ class Mem0Memory:
 
     def snapshot(self) -> bytes:
         pending = joined(s.json for s in self._pending)
-        flags = [self._waited, self._left, self._ignored]
+        flags = [self._waited, self._left, self._ignored, self._task]
         return dump_state([self.entries.state(), self.summary, pending, list(self._lines), self._unsummarised, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, self.summary, pending, lines, self._unsummarised, flags = load_state(blob)
-        self._waited, self._left, self._ignored = flags
+        self._waited, self._left, self._ignored, self._task = flags
         self.entries.load(entries)
         self._pending = [Step.load(s) for s in pending]
         self._lines = deque(lines, maxlen=self._lines.maxlen)

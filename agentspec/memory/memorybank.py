@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -187,6 +188,7 @@ class MemoryBank:
         self._merged: list[int] = []  # summaries and insights that are not in the overview yet
         self._plan = ""
         self._days, self._last_pass = 0, 0
+        self._seed = services.rng.getrandbits(32)  # of the draws: a restored memory forgets as it would have
         self._day_began, self._held_from = 0, 0  # steps of this episode
         self._task = ""
         self._forgotten = 0
@@ -306,11 +308,11 @@ class MemoryBank:
 
     def _fade(self) -> None:
         """Ebbinghaus: draw, or compare with the threshold; what belongs to the running day is not touched."""
-        now = self.services.time()
+        now, draw = self.services.time(), random.Random(f"{self._seed}/{self._days}")
         for key, entry in list(self.entries.items()):
             if self.forget == "sample":
                 elapsed = now.total - max(entry.since, self._last_pass)
-                stays = self.services.rng.random() < retention(elapsed, entry.strength, self.time_unit)
+                stays = draw.random() < retention(elapsed, entry.strength, self.time_unit)
             else:
                 stays = self.forget == "never" or self._retained(key) >= self.least
             if not stays:
@@ -386,12 +388,12 @@ class MemoryBank:
         return {**counts, "forgotten": self._forgotten, "mean_strength": strength}
 
     def snapshot(self) -> bytes:
-        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
+        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed]
         return dump_state([keyed(self.entries), self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
         entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)
-        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten = times
+        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed = times
         self.entries = {key: Entry(*values) for key, values in entries}
         for kind, index in self._index.items():
             index.load([(key, entry.text) for key, entry in self.entries.items() if entry.kind == kind])

@@ -158,7 +158,7 @@ class ACE:
         """The playbook by sections, its best bullets mattering most, and the last review."""
         if self._waiting.due:
             self._waiting.due = False
-            await self._adapt(input.instruction)
+            await self._adapt()
         source = self.services.llm.module
         shown = self.playbook.ordered()
         if k:
@@ -177,8 +177,9 @@ class ACE:
         waiting.steps = [*waiting.steps, block + named][-self._most_waiting :]
         waiting.cited = list(dict.fromkeys([*waiting.cited, *cited]))
         waiting.since += 1
+        waiting.task = transition.input.instruction
         if self.every and waiting.since >= self.every and not (transition.terminated or transition.truncated):
-            await self._adapt(transition.input.instruction, transition.next_text)
+            await self._adapt(transition.next_text)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is reflected on with the outcome when the next episode of the run begins."""
@@ -193,10 +194,10 @@ class ACE:
 
     # -- reflector and curator -------------------------------------------------------------------------------------
 
-    async def _adapt(self, instruction: str, next_text: str = "") -> None:
+    async def _adapt(self, next_text: str = "") -> None:
         """Reflect on the steps that wait, then curate if it is time to."""
         self._waiting.since = 0
-        task = clip_text(instruction.strip(), self.task_tokens, self._count) or "(not told)"
+        task = clip_text(self._waiting.task.strip(), self.task_tokens, self._count) or "(not told)"
         review = await self._reflect(task, next_text)
         if review is None:
             return

@@ -44,10 +44,12 @@ class Counts:
 
 @dataclass
 class Waiting:
-    """Steps to be reflected on, what they cited, how many steps since the last reflection, reviews to be curated."""
+    """Steps to be reflected on with the instruction they followed, what they cited, how many steps since the last
+    reflection, reviews to be curated."""
 
     steps: list[str] = field(default_factory=list)
     cited: list[str] = field(default_factory=list)
     since: int = 0
     reviews: list[str] = field(default_factory=list)
     due: bool = False
+    task: str = ""

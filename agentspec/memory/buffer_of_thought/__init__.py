@@ -140,6 +140,7 @@ class BufferOfThought:
         self._problem, self._working = "", ""  # what stands in every prompt of the episode
         self._looked_up = ""  # what the template was looked up by
         self._started = False
+        self._done = ""  # the instruction that the newest step followed
         self._course: list[list[str]] = []
         self._finished: list[list[str]] = []  # the course of the episode before, until a template is distilled from it
         self._figures = {"templates": 0, "kept": 0, "known": 0, "coarse": 0}
@@ -156,7 +157,7 @@ class BufferOfThought:
         """The distilled task and the way of working, both chosen before the first action (`k` changes nothing)."""
         if not self._started:
             self._started = True
-            await self._manage(input.instruction)
+            await self._manage()
             await self._begin(input)
         source = self.services.llm.module
         items = []
@@ -170,6 +171,7 @@ class BufferOfThought:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
+        self._done = transition.input.instruction
         state = excerpt(seen.state, self.state_tokens, self._count)
         self._course = [*self._course, [state, seen.line()]][-MOST_STEPS:]
 
@@ -211,12 +213,12 @@ class BufferOfThought:
 
     # -- after an episode ------------------------------------------------------------------------------------------
 
-    async def _manage(self, instruction: str) -> None:
+    async def _manage(self) -> None:
         """Distil a template from the episode before, and keep it if it is new."""
         if not self._finished or self._index is None:
             return
         finished, self._finished = self._finished, []
-        template = await self._distilled(instruction, finished) if self.asks else self._without_model(finished)
+        template = await self._distilled(finished) if self.asks else self._without_model(finished)
         if template is None:
             return
         self._figures["templates"] += 1
@@ -225,10 +227,10 @@ class BufferOfThought:
         else:
             self._figures["known"] += 1
 
-    async def _distilled(self, instruction: str, finished: list[list[str]]) -> Template | None:
+    async def _distilled(self, finished: list[list[str]]) -> Template | None:
         course = telling.course(finished[1:], self.course_tokens, self._count)
         prompt = (
-            system(prompts.TEMPLATE.format(task=self._task(instruction))),
+            system(prompts.TEMPLATE.format(task=self._task(self._done))),
             user(prompts.EPISODE.format(problem=finished[0][1], steps=telling.STEPS, course=course)),
         )
         parse = json_of({"category": str, "description": str, "template": str}, repairs=self.repairs)
@@ -286,12 +288,12 @@ class BufferOfThought:
         return {"size": len(self._buffer), **self._figures}
 
     def snapshot(self) -> bytes:
-        episode = [self._problem, self._working, self._looked_up, self._started]
+        episode = [self._problem, self._working, self._looked_up, self._started, self._done]
         return dump_state([keyed(self._buffer), episode, self._course, self._finished, self._figures])
 
     def restore(self, blob: bytes) -> None:
         buffer, episode, self._course, self._finished, self._figures = load_state(blob)
-        self._problem, self._working, self._looked_up, self._started = episode
+        self._problem, self._working, self._looked_up, self._started, self._done = episode
         self._buffer = {key: Template(*row) for key, row in buffer}
         if self._index is not None:
             self._index.load([(key, template.description) for key, template in self._buffer.items()])

@@ -148,6 +148,7 @@ class DynamicCheatsheet:
         self._unseen: list[int] = []  # `rs`: their keys
         self._lines: list[str] = []  # the same as the agent is told them
         self._waited = 0  # steps since the curator was last asked
+        self._task = ""  # the instruction that the newest step followed
         self._due = False  # whether an earlier episode left something to be curated
         self._pairs: dict[int, Pair] = {}  # `rs`: steps by key
         self._rewrites = 0
@@ -166,7 +167,7 @@ class DynamicCheatsheet:
         if self.variant == "rs":
             await self._synthesise(input, k or self.top)
         elif self._due:
-            await self._curate(input.instruction)
+            await self._curate()
         self._due = False
         text = f"{HEADER}\n{self._sheet}"
         items = [RecallItem(text, kind="summary", source=self._name, priority=math.inf)] if self._sheet else []
@@ -178,6 +179,7 @@ class DynamicCheatsheet:
     async def store(self, transition: Transition) -> None:
         block = telling.told(transition, self.step_tokens, self.services.llm.count_tokens)
         self._lines = [*self._lines, Experience.of(transition).line()][-self._most_waiting :]
+        self._task = transition.input.instruction
         self._waited += 1
         if self.variant == "rs":
             self._keep(transition.input.text, block)
@@ -186,7 +188,7 @@ class DynamicCheatsheet:
         if self.variant == "rs":
             return
         if self._waited >= self.every and not (transition.terminated or transition.truncated):
-            await self._curate(transition.input.instruction, transition.next_text)
+            await self._curate(transition.next_text)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is curated with the outcome when the next episode of the run begins."""
@@ -211,11 +213,11 @@ class DynamicCheatsheet:
 
     # -- curation --------------------------------------------------------------------------------------------------
 
-    async def _curate(self, instruction: str, next_text: str = "") -> None:
+    async def _curate(self, next_text: str = "") -> None:
         """`cu`: the sheet anew from the steps since."""
         steps = f"{telling.STEPS}\n{telling.numbered(self._since)}"
         now = prompts.LEADS_TO.format(state=self._state(next_text)) if next_text else prompts.NEW
-        await self._rewrite("curate", instruction, [steps, now], "")
+        await self._rewrite("curate", self._task, [steps, now], "")
 
     async def _synthesise(self, input: AgentInput, top: int) -> None:
         """`rs`: the sheet anew for the present state, from the past steps most similar to it."""
@@ -312,12 +314,12 @@ class DynamicCheatsheet:
         return {"rewrites": self._rewrites, "sheet_tokens": self._count(self._sheet), "steps": len(self._pairs)}
 
     def snapshot(self) -> bytes:
-        flags = [self._waited, self._due, self._rewrites]
+        flags = [self._waited, self._due, self._rewrites, self._task]
         return dump_state([self._sheet, self._since, self._unseen, self._lines, flags, keyed(self._pairs)])
 
     def restore(self, blob: bytes) -> None:
         self._sheet, self._since, self._unseen, self._lines, flags, pairs = load_state(blob)
-        self._waited, self._due, self._rewrites = flags
+        self._waited, self._due, self._rewrites, self._task = flags
         self._pairs = {key: Pair(*row) for key, row in pairs}
         if self._index is not None:
             self._index.load([(key, pair.state) for key, pair in self._pairs.items()])

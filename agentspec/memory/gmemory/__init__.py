@@ -214,7 +214,7 @@ class GMemory:
         if self._recalled is None:
             self._recalled = []
             self._began = f"{task_of(input.instruction, self.task_tokens, self.services)}\n{self._start_of(input.text)}"
-            await self._learn(input.instruction)
+            await self._learn()
             self._recalled = await self._related(k)
         lines = shown_lines(self.services, self._lines, self.recent)
         newest = [RecallItem(line, source=self._name, priority=1 + i) for i, line in enumerate(lines)]
@@ -288,7 +288,7 @@ class GMemory:
         for id in [id for id in self.graph if id not in self.episodes]:
             self.graph.remove(id)
 
-    async def _learn(self, instruction: str) -> None:
+    async def _learn(self) -> None:
         """Key steps or mistake of the episode before; from time to time rules out of several; rules merged."""
         if self._unlearnt is None:
             return
@@ -299,7 +299,7 @@ class GMemory:
             ended=f"{verdict(episode)} (return {episode.data['return']:+.2f})",
             what=KEY if good else MISTAKE,
             words=max(8, self.key_tokens // 2),
-            task=task_of(instruction, self.task_tokens, self.services),
+            task=episode.text.partition("\n")[0],
         )
         prompt = (system(static), user(CHAIN.format(chain=self._chain)))
         answer = await self.services.ask("steps" if good else "mistake", prompt, self.key_tokens)

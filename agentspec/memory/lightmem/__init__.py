@@ -207,6 +207,7 @@ class LightMemory:
         self.topics: list[tuple[int, list[Step]]] = []  # short-term memory
         self._topic = 0  # topics so far
         self._lines: list[str] = []
+        self._task = ""  # the instruction that the newest step followed
         self._asleep = False  # whether an episode has ended since the last sleep
 
     def begin_episode(self, task: Task) -> None:
@@ -220,7 +221,7 @@ class LightMemory:
             self._topics_of(self.sensory)
             self.sensory = []
             if self.topics:
-                await self._extract(input.instruction)
+                await self._extract()
             await self._sleep()
         now = self.services.time()
         found = [(dated(entry, now), score) for entry, score in self.entries.near(input.text, k or self.top)]
@@ -235,9 +236,10 @@ class LightMemory:
         block = replace(seen, state=state).block(self.step_tokens, self.services.llm.count_tokens)
         self.sensory.append(replace(step, text=block))
         self._lines = [*self._lines, step.line][-MOST_LINES:]
+        self._task = transition.input.instruction
         ended = transition.terminated or transition.truncated
         if self._tokens(self.sensory) >= self.sensory_tokens and not ended:
-            await self._segment(transition.input.instruction)
+            await self._segment()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is in the buffers becomes facts in the sleep before the next episode of the run."""
@@ -260,7 +262,7 @@ class LightMemory:
         scores = await self.services.llm.score((user("What is seen:"),), beginnings)
         return [before - after for before, after in zip((0.0, *scores), scores, strict=False)]
 
-    async def _segment(self, instruction: str) -> None:
+    async def _segment(self) -> None:
         """Stages 4 and 5: topics move to short-term memory, which becomes facts before it is too full."""
         vectors = self.entries.embed([s.text for s in self.sensory])
         starts = boundaries([float(a @ b) for a, b in itertools.pairwise(vectors)])
@@ -268,7 +270,7 @@ class LightMemory:
         ready, self.sensory = self.sensory[:done], self.sensory[done:]
         full = sum(self._tokens(steps) for _, steps in self.topics)
         if self.topics and full + self._tokens(ready) > self.stm_tokens:
-            await self._extract(instruction)
+            await self._extract()
         cuts = [0, *starts] if starts else [0, done]
         for begin, end in itertools.pairwise(cuts):
             self._topics_of(ready[begin:end])
@@ -280,11 +282,11 @@ class LightMemory:
             self.topics.append((self._topic, steps))
             self._topic += 1
 
-    async def _extract(self, instruction: str) -> None:
+    async def _extract(self) -> None:
         """Stage 6: one call over short-term memory; its facts are added as they are."""
         steps = [(topic, step) for topic, steps in self.topics for step in steps]
         parse = json_of({"facts": list[dict[str, Any]]}, repairs=self.repairs)
-        answer = await self.services.ask("extract", self._extraction(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
         self.topics = []
@@ -298,8 +300,8 @@ class LightMemory:
                 entry = Entry(self.services.new_id(), one_line(text), step.time, {"topic": topic, "checked": -1})
                 self.entries.put(entry)
 
-    def _extraction(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _extraction(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         parts, number = [STEPS], 0
         newest = self.topics[-1][1][-1].time
         for topic, steps in self.topics:
@@ -356,12 +358,12 @@ class LightMemory:
     def snapshot(self) -> bytes:
         topics = [[topic, [s.row() for s in steps]] for topic, steps in self.topics]
         sensory = joined(s.json for s in self.sensory)
-        flags = [self._topic, self._asleep]
+        flags = [self._topic, self._asleep, self._task]
         return dump_state([self.entries.state(), self.words.counts, sensory, topics, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, self.words.counts, sensory, topics, self._lines, flags = load_state(blob)
-        self._topic, self._asleep = flags
+        self._topic, self._asleep, self._task = flags
         self.entries.load(entries)
         self.sensory = [Step.load(s) for s in sensory]
         self.topics = [(topic, [Step.load(s) for s in steps]) for topic, steps in topics]

@@ -196,6 +196,7 @@ class SimpleMemory:
         self._before: list[list[str]] = []  # what the gate compares with: states, and what was done in them
         self._lines: list[str] = []
         self._left = False
+        self._task = ""  # the instruction that the newest step followed
         self._dropped = 0
 
     def begin_episode(self, task: Task) -> None:
@@ -209,7 +210,7 @@ class SimpleMemory:
         """The notes that score best; what an earlier episode left is written first."""
         if self._left and self._new:
             self._left = False
-            await self._compress(input.instruction)
+            await self._compress()
         now = self.services.time()
         found = await self._planned(input.text, k) if self.plan else self.search(input.text, k)
         lines = shown_lines(self.services, self._lines, max(self.recent, self._new) if self.recent else 0)
@@ -280,6 +281,7 @@ class SimpleMemory:
     async def store(self, transition: Transition) -> None:
         step = Step.of(transition, self.services, self.step_tokens)
         self._lines = [*self._lines, step.line][-max(1, self.recent, self.window) :]
+        self._task = transition.input.instruction
         parts = [transition.input.text, step.line.partition(". ")[2]]
         novelty = max(self.novelty(part, [b[i] for b in self._before]) for i, part in enumerate(parts))
         novel = novelty >= self.gate or bool(transition.reward)
@@ -289,7 +291,7 @@ class SimpleMemory:
             self._window = [*self._window, step][-2 * self.window - self.overlap :]
             self._new = min(self._new + 1, len(self._window))
         if self._new >= self.window and not (transition.terminated or transition.truncated):
-            await self._compress(transition.input.instruction)
+            await self._compress()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is compressed when the next episode of the run begins."""
@@ -305,10 +307,10 @@ class SimpleMemory:
         nearest = min(1.0, max(float(vectors[0] @ other) for other in vectors[1:]))
         return self.weight * fresh + (1 - self.weight) * (1 - nearest)
 
-    async def _compress(self, instruction: str) -> None:
+    async def _compress(self) -> None:
         """One call over the window; what it wrote, and what that brought together."""
         parse = json_of({"notes": list[Note]}, repairs=self.repairs)
-        answer = await self.services.ask("compress", self._compression(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("compress", self._compression(), self.answer_tokens, parse)
         at = self._window[-1].time
         if answer.value is None:
             self._new = 0
@@ -323,8 +325,8 @@ class SimpleMemory:
         if self.consolidate:
             await self._merge([e for e in added if e.id in self.entries])
 
-    def _compression(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _compression(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         newest = list(self.entries)[-self.context :] if self.context else []
         now = self._window[-1].time
         parts = ["\n".join([NOTES, *(dated(e, now) for e in newest)])] if newest else []
@@ -396,13 +398,13 @@ class SimpleMemory:
 
     def snapshot(self) -> bytes:
         archive = joined(e.json for e in self.archive)
-        flags = [self._new, self._left, self._dropped]
+        flags = [self._new, self._left, self._dropped, self._task]
         window = joined(s.json for s in self._window)
         return dump_state([self.entries.state(), archive, window, self._before, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, archive, window, self._before, self._lines, flags = load_state(blob)
-        self._new, self._left, self._dropped = flags
+        self._new, self._left, self._dropped, self._task = flags
         self.entries.load(entries)
         self.archive = [Entry.load(row) for row in archive]
         self._window = [Step.load(s) for s in window]
