@@ -231,7 +231,7 @@ class Mem0Memory:
             await self._write()
         now = self.services.time()
         found = [(dated(entry, now), score) for entry, score in self.entries.near(input.text, k or self.top)]
-        lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(found, lines, self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:

@@ -38,6 +38,7 @@ from agentspec.memory.parts.steps import (
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import when
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -215,7 +216,7 @@ class MemoryBank:
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
+            items += [RecallItem(brief(self._named(e), count), 1.0, "step", priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -363,7 +364,8 @@ class MemoryBank:
 
     def _item(self, key: int, score: float) -> RecallItem:
         entry = self.entries[key]
-        label = {"raw": "", "summary": "[Trajectory Summary] ", "insight": "[Environment Insight] "}[entry.kind]
+        over = when(entry.episode, self.services.time().episode)
+        label = {"summary": f"[Trajectory Summary] {over}", "insight": "[Environment Insight] "}.get(entry.kind, "")
         text = self._named(entry) if entry.kind == "raw" else f"{label}{entry.text}"
         kind = "episodic" if entry.kind == "raw" else entry.kind
         return RecallItem(

@@ -25,7 +25,12 @@ def test_a_course_keeps_what_was_done_and_shares_the_rest_among_states() -> None
     assert [line for line in told if line[0] in "123"] == [line for _, line in steps]
     assert [len(line) for line in told if line.startswith("State: ")] == [29, 29] and len("\n".join(told)) == 99
     assert telling.course(steps, 45, len) == "1. GO -> ok\n2. TAKE -> no\n3. WAIT -> ok"  # no room to say anything
-    assert telling.course(steps, 20, len) == "1. GO -> ok\n2. T ..."
+    # No room for all of them: the newest and the first ones stay, and how many are missing is said.
+    assert telling.course(steps, 20, len) == "3. WAIT -> ok"
+    many = [["", f"{i}. GO -> ok"] for i in range(1, 8)] + [["", "It failed."]]
+    left = "(5 steps between these are left out)"
+    assert telling.course(many, 74, len) == f"1. GO -> ok\n{left}\n7. GO -> ok\nIt failed."
+    assert telling.course(many, 8, len) == "It f ..."
     assert telling.course([["s", "1. GO -> ok"]], 40, len) == "State: s\n1. GO -> ok"
 
 

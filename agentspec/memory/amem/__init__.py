@@ -129,8 +129,6 @@ class AMem:
         source = self.services.llm.module
         texts = [self._shown(note) for note in self._found(input.text, k or self.top)]
         recall = telling.listed([*([telling.NOTES] if texts else []), *texts], source)
-        if self.services.context.layout == "conversation":
-            return recall
         lines = [RecallItem(line, kind="step", source=source, priority=i) for i, (_, line) in enumerate(self._open)]
         return Recall((*recall.items, *lines))
 

@@ -200,7 +200,7 @@ class CamMemory:
             near = self.nodes.near(input.text, 2 * top)
             found = list({node.text: (node, score) for node, score in reversed(near)}.values())[::-1][:top]
         notes = [(self.shown(node), score) for node, score in found]
-        lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(notes, lines, self.services.llm.module)
 
     async def _pick(self, state: str, k: int | None) -> list[tuple[Entry, float]] | None:

@@ -134,7 +134,7 @@ class ChatDB:
             newest = "WHERE episode = ? AND step >= ? ORDER BY id"
             rows = self._lines(newest, (now.episode, max(0, now.step - self.recent)))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(line, count), priority=3.0 + i) for i, (_, line) in enumerate(rows)]
+            items += [RecallItem(brief(line, count), kind="step", priority=3.0 + i) for i, (_, line) in enumerate(rows)]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:

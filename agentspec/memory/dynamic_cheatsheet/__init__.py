@@ -163,7 +163,7 @@ class DynamicCheatsheet:
         self._lines = []
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        """The sheet; where the conversation does not show them, the steps that it does not know yet."""
+        """The sheet, and the steps that it does not know yet (where the prompt does not tell these anyway)."""
         if self.variant == "rs":
             await self._synthesise(input, k or self.top)
         elif self._due:
@@ -171,9 +171,8 @@ class DynamicCheatsheet:
         self._due = False
         text = f"{HEADER}\n{self._sheet}"
         items = [RecallItem(text, kind="summary", source=self._name, priority=math.inf)] if self._sheet else []
-        if self.services.context.layout == "snapshot":
-            since = enumerate(self._lines)
-            items += [RecallItem(line, kind="step", source=self._name, priority=i) for i, line in since]
+        since = enumerate(self._lines)
+        items += [RecallItem(line, kind="step", source=self._name, priority=i) for i, line in since]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:

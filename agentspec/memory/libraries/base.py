@@ -150,7 +150,7 @@ class LibraryMemory(ABC):
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """The memories nearest to the observation, then the newest steps."""
         found = await self._guarded(self.search(input.text, k or self.top)) or []
-        lines = shown_lines(self.services, self._lines, self.recent)
+        lines = shown_lines(self._lines, self.recent)
         return recalled([(f"- {text}", score) for text, score in found], lines, self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:

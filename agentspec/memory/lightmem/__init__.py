@@ -226,7 +226,7 @@ class LightMemory:
         now = self.services.time()
         found = [(dated(entry, now), score) for entry, score in self.entries.near(input.text, k or self.top)]
         waiting = len(self.sensory) + sum(len(steps) for _, steps in self.topics)
-        lines = shown_lines(self.services, self._lines, max(self.recent, waiting) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, waiting) if self.recent else 0)
         return recalled(found, lines, self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:

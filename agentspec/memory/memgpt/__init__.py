@@ -152,7 +152,8 @@ class MemGPT:
             if self.summary:
                 items.append(RecallItem(CARRY.format(summary=self.summary), kind="summary", priority=3.0))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(m), count), priority=5.0 + m.step) for m in self._queue()]
+            queue = [(m.step, brief(self._named(m), count)) for m in self._queue()]
+            items += [RecallItem(text, kind="step", priority=5.0 + step) for step, text in queue]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:

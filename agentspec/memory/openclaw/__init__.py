@@ -214,7 +214,7 @@ class OpenClaw:
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(c), count), 1.0, priority=5.0 + c.step) for c in newest]
+            items += [RecallItem(brief(self._named(c), count), 1.0, "step", priority=5.0 + c.step) for c in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:

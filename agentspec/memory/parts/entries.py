@@ -274,7 +274,7 @@ def one_line(text: str) -> str:
 def recalled(notes: Iterable[tuple[str, float]], lines: Sequence[str], source: str) -> Recall:
     """Notes, the best first, and after them the newest steps (which matter most), oldest first."""
     items = [RecallItem(text, score, "semantic", source, -i) for i, (text, score) in enumerate(notes)]
-    newest = [RecallItem(line, source=source, priority=1 + i) for i, line in enumerate(lines)]
+    newest = [RecallItem(line, kind="step", source=source, priority=1 + i) for i, line in enumerate(lines)]
     return Recall((*items, *newest))
 
 
@@ -283,9 +283,9 @@ def dated(entry: Entry, now: Time) -> str:
     return f"- {entry.text} [{stamp(entry.time, now)}]"
 
 
-def shown_lines(services: Services, lines: Sequence[str], most: int) -> list[str]:
-    """The newest lines, where the conversation does not hold the steps themselves."""
-    return list(lines)[-most:] if most and services.context.layout == "snapshot" else []
+def shown_lines(lines: Sequence[str], most: int) -> list[str]:
+    """The newest lines; those of steps that the prompt tells anyway are left out there (`agentspec.prompting`)."""
+    return list(lines)[-most:] if most else []
 
 
 __all__ = [

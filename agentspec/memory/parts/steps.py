@@ -12,7 +12,7 @@ from agentspec.memory.parts.telling import newest_that_fit
 from agentspec.services import Answer, Services, Time
 from agentspec.tokens import CountTokens, clip_text, excerpt
 from agentspec.trajectory import Trajectory
-from agentspec.types import Experience, Transition
+from agentspec.types import Experience, RecallItem, Transition
 
 FEEDBACK_TOKENS = 64
 """Most tokens kept of what the environment said about an action."""
@@ -51,6 +51,15 @@ def distinct(hits: Sequence[tuple[int, float]], text: Callable[[int], str]) -> l
     for hit in hits:
         found.setdefault(text(hit[0]), hit)
     return list(found.values())
+
+
+def newest_steps(texts: Sequence[str], recent: int, count_tokens: CountTokens) -> list[RecallItem]:
+    """Steps that no entry knows yet: the newest `recent` before everything else, older ones where there is room."""
+    first = len(texts) - recent
+    return [
+        RecallItem(brief(text, count_tokens), kind="step", priority=5.0 + i if i >= first else i / len(texts))
+        for i, text in enumerate(texts)
+    ]
 
 
 def step_name(episode: int, step: int, now: Time) -> str:

@@ -213,7 +213,7 @@ class SimpleMemory:
             await self._compress()
         now = self.services.time()
         found = await self._planned(input.text, k) if self.plan else self.search(input.text, k)
-        lines = shown_lines(self.services, self._lines, max(self.recent, self._new) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, self._new) if self.recent else 0)
         return recalled([(dated(e, now), score) for e, score in found], lines, self.services.llm.module)
 
     def search(self, query: str, k: int | None = None) -> list[tuple[Entry, float]]:

@@ -218,8 +218,8 @@ class ZepMemory:
         )
         notes = [(self.shown(entry), score) for entry, score in found]
         summary = self.communities.summary_for(self.graph.named_in(input.text))
-        notes = [(f"- {summary}", 1.0), *notes] if summary else notes
-        lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
+        notes = [(f"- Of earlier episodes: {summary}", 1.0), *notes] if summary else notes
+        lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(notes, lines, self.services.llm.module)
 
     def shown(self, fact: Entry) -> str:
