@@ -53,12 +53,12 @@ HEAD = "You manage the memory of an agent that acts in an environment.\n\nTask: 
 SEMANTIC = (
     "\n\nFacts on record that may be about the same:\n{facts}\n\nKeep the record of facts true: insert what is new and "
     "will matter later, patch (put a new text in place of the fact of that id) what has changed, delete what proved "
-    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits, none if "
-    "nothing is new. Answer with JSON:\n"
+    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits and "
+    "{words} words in all, none if nothing is new. Answer with JSON:\n"
     '{{"edits": [{{"op": "insert" | "patch" | "delete", "id": number or null, "text": fact}}]}}'
 )
 EPISODIC = (
-    "\n\nWrite these steps down as one experience to learn from. Answer with JSON:\n"
+    "\n\nWrite these steps down as one experience to learn from, in at most {words} words. Answer with JSON:\n"
     '{{"observation": what the situation was, "thoughts": what mattered in it, "action": what was done, '
     '"result": what came of it, with numbers, and what would have been better}}'
 )
@@ -227,7 +227,7 @@ class LangMem:
     async def _edit_facts(self, steps: Sequence[str], ending: str) -> None:
         near = self._nearest(self._fact_index, " ".join(steps), self.query_limit)
         facts = "\n".join(f"{key}: {self._dated(key)[2:]}" for key, _ in near) or "(none)"
-        prompt = self._head(steps, ending) + SEMANTIC.format(facts=facts, most=EDITS)
+        prompt = self._head(steps, ending) + SEMANTIC.format(facts=facts, most=EDITS, words=self.answer_tokens // 2)
         answer = await self.services.ask("semantic", prompt, self.answer_tokens, json_of({"edits": list[Edit]}))
         for edit in answer.value["edits"][:EDITS] if answer.value else ():
             self._apply(edit)
@@ -251,7 +251,7 @@ class LangMem:
         self._written = {key: self._written[key] for key in self.facts}
 
     async def _write_episode(self, steps: Sequence[str], ending: str) -> None:
-        prompt = self._head(steps, ending) + EPISODIC.format()
+        prompt = self._head(steps, ending) + EPISODIC.format(words=self.answer_tokens // 2)
         answer = await self.services.ask("episodic", prompt, self.answer_tokens, json_of(Episode))
         if answer.value is not None:
             episode = Episode(*(self._clip(text, self.entry_tokens) for text in astuple(answer.value)))

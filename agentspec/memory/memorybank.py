@@ -68,7 +68,7 @@ CONCLUDE = (
     "\n\nInsights so far:\n{known}\n\nWhat do the steps show about this environment that will hold again? Give costs, "
     "durations and thresholds as numbers; repeat nothing that is known; invent nothing. Answer with JSON:\n"
     '{{"insights": [at most 3 sentences], "avoid": [at most 2 things not to do, and why], '
-    '"next": [the 3 things to do {next}, in order]}}'
+    '"next": [the 3 things to do {next}, in order]}}, at most {words} words in all'
 )
 OVERVIEW = (
     "You keep the memory of an agent that acts in an environment. Merge its overview with the newer notes into one "
@@ -257,11 +257,15 @@ class MemoryBank:
         steps = newest_within([self._named(e) for e in day], self.steps_tokens, count)
         head = HEAD.format(task=self._task, steps="\n".join(steps + ([ending] if ending else [])))
         known = [e.text for e in self.entries.values() if e.kind == "insight"]
-        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count)
+        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count, "ones")
         prompts = (
             head + SUMMARISE.format(words=self.answer_tokens // 3),
             head
-            + CONCLUDE.format(known="\n".join(known) or "(none)", next="in the next episode" if ending else "next"),
+            + CONCLUDE.format(
+                known="\n".join(known) or "(none)",
+                words=self.answer_tokens // 2,
+                next="in the next episode" if ending else "next",
+            ),
         )
         summary, found = await asyncio.gather(
             self.services.ask("summary", prompts[0], self.answer_tokens),
@@ -277,7 +281,7 @@ class MemoryBank:
         prompt = OVERVIEW.format(
             words=self.answer_tokens // 2,
             overview=self.overview or "(none)",
-            notes="\n".join(newest_within(notes, self.steps_tokens, count)),
+            notes="\n".join(newest_within(notes, self.steps_tokens, count, "notes")),
         )
         answer = await self.services.ask("overview", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, count)

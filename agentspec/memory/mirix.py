@@ -66,13 +66,15 @@ ROUTE = '\n\nWhich stores do these steps add to, or correct? Answer with JSON:\n
 RELATED_TO = "\n\nEntries that may be about the same:\n{entries}"
 EDIT = (
     "\n\nEdit the store `{store}`. Make one edit: insert (a new entry), merge (add to the entry of that id), update "
-    "(put new texts in place of those of that id), or none. Keep numbers, ids and places. Answer with JSON:\n"
+    "(put new texts in place of those of that id), or none. Keep numbers, ids and places, in at most {words} words. "
+    "Answer with JSON:\n"
     '{{"op": "insert" | "merge" | "update" | "none", "id": number or null, "fields": {{{fields}}}}}'
 )
 EDIT_ALL = (
     "\n\nEdit the stores: at most one edit each, none where nothing is new. insert (a new entry), merge (add to the "
-    "entry of that id), update (put new texts in place of those of that id). Keep numbers, ids and places. Answer with "
-    'JSON:\n{{"edits": [{{"store": name, "op": "insert" | "merge" | "update", "id": number or null, '
+    "entry of that id), update (put new texts in place of those of that id). Keep numbers, ids and "
+    "places, in at most {words} words in all. Answer with JSON:\n"
+    '{{"edits": [{{"store": name, "op": "insert" | "merge" | "update", "id": number or null, '
     '"fields": {{field: text}}}}]}}'
 )
 REWRITE = (
@@ -238,7 +240,7 @@ class Mirix:
         query = " ".join(steps)
         if self.routing == "single":
             related = [key for store in SEARCHED for key, _ in self._search(store, query, 1)]
-            prompt = head + self._related(related) + EDIT_ALL.format()
+            prompt = head + self._related(related) + EDIT_ALL.format(words=self.answer_tokens // 2)
             answer = await self.services.ask(
                 "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]})
             )
@@ -261,7 +263,7 @@ class Mirix:
         """The one edit of a store's manager."""
         related = [key for key, _ in self._search(store, query, RELATED)] if store != "core" else []
         fields = ", ".join(f'"{name}": text' for name in STORES[store][1])
-        prompt = head + self._related(related) + EDIT.format(store=store, fields=fields)
+        prompt = head + self._related(related) + EDIT.format(store=store, fields=fields, words=self.answer_tokens // 2)
         answer = await self.services.ask("edit", prompt, self.answer_tokens, json_of(Edit))
         return answer.value
 

@@ -95,7 +95,7 @@ def test_only_steps_that_cost_something_are_left_out_of_the_chain() -> None:
     episode(bench, 0.0, -0.5, 2.0)
     prompt = bench.prompt("steps")
     assert "succeeded (return +1.50)" in prompt and "Deliver food." in prompt
-    assert "1. WAIT()" in prompt and "3. WAIT()" in prompt and "2. WAIT()" not in prompt
+    assert "1. GO(0)" in prompt and "3. GO(2)" in prompt and "2. GO(1)" not in prompt
     assert bench.purposes() == ["steps"]
     assert bench.shown() == "An earlier episode succeeded (return +1.50, 3 steps): 1. GO()"
 

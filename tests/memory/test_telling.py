@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import step_text
 from agentspec.tokens import estimate_tokens, excerpt
+from agentspec.types import Experience
 from tests.memory.one_step import step
 
 
@@ -54,3 +58,13 @@ def test_an_excerpt_of_an_observation_keeps_the_orders() -> None:
 def test_an_excerpt_stays_within_its_budget(text: str, tokens: int) -> None:
     assert excerpt(text, tokens) == "" or estimate_tokens(excerpt(text, tokens)) <= tokens
     assert len(excerpt(text, tokens, len)) <= tokens
+
+
+def test_what_failed_is_never_told_as_done() -> None:
+    failed = Experience.of(step(0, "s", "JUMP()", error="there is no such action", message=""))
+    assert (failed.ok, failed.feedback) == (False, "there is no such action")
+    silent = replace(step(0, "s", "JUMP()"), info={"invalid": True})
+    assert (Experience.of(silent).ok, Experience.of(silent).line()) == (False, "1. JUMP() -> failed")
+    unread = replace(step(0, "s", "JUMP()", error="no action in it"), info={})
+    assert Experience.of(unread).line() == "1. JUMP() -> no action in it"
+    assert step_text(silent, 0, len) == "JUMP() failed: failed"

@@ -155,7 +155,7 @@ class ACE:
         self._waiting.due = bool(self._waiting.steps)
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        """The playbook by sections, its best bullets mattering most, and the last review."""
+        """The playbook by sections, its best bullets (of equals the newest) mattering most, and the last review."""
         if self._waiting.due:
             self._waiting.due = False
             await self._adapt()
@@ -164,10 +164,12 @@ class ACE:
         if k:
             best = sorted(shown, key=lambda b: (-b.balance, -b.number))[:k]
             shown = [b for b in shown if b in best]
-        items = [RecallItem(b.line(), float(b.balance), "procedural", source, b.balance) for b in shown]
+        worth = {b.id: i for i, b in enumerate(sorted(shown, key=lambda b: (b.balance, b.number)))}
+        items = [RecallItem(b.line(), float(b.balance), "procedural", source, worth[b.id]) for b in shown]
         head = [RecallItem(prompts.HEADER, kind="procedural", source=source, priority=math.inf)] if items else []
-        last = [RecallItem(prompts.LAST.format(text=self._last), kind="summary", source=source)] if self._last else []
-        return Recall((*head, *items, *last))
+        last = prompts.LAST.format(text=self._last)
+        said = [RecallItem(last, kind="summary", source=source, priority=math.inf)] if self._last else []
+        return Recall((*head, *items, *said))
 
     async def store(self, transition: Transition) -> None:
         waiting = self._waiting
@@ -204,7 +206,7 @@ class ACE:
         self._counts.reviews += 1
         self._last = clip_text(review.correct or review.insight, self.bullet_tokens, self._count)
         for verdict in review.bullets:
-            self.playbook.tag(verdict.id, verdict.tag)
+            self.playbook.tag(verdict.id, verdict.tag.strip().lower())
         waiting = self._waiting
         waiting.reviews = [*waiting.reviews, review.text()][-2 * self.curate_every :]
         waiting.steps, waiting.cited = [], []
@@ -218,7 +220,8 @@ class ACE:
         steps = f"{telling.STEPS}\n{telling.numbered(self._waiting.steps)}"
         state = excerpt(next_text, self.step_tokens, self._count)
         now = [prompts.NOW.format(state=state)] if state else []
-        parts = [*([head] if shown else []), steps, *now, prompts.REVIEW]
+        review_it = prompts.REVIEW.format(words=self.answer_tokens // 2)
+        parts = [*([head] if shown else []), steps, *now, review_it]
         prompt = _prompt(prompts.REFLECTOR.format(task=task), parts)
         answer = await self.services.ask("reflect", prompt, self.answer_tokens, json_of(Review, repairs=self.repairs))
         review: Review | None = answer.value
@@ -231,7 +234,8 @@ class ACE:
             count=len(bullets), used=used, budget=self.playbook_tokens, bullets=_lines(bullets) or "(empty)"
         )
         reviews = prompts.REVIEWS.format(reviews="\n".join(f"- {text}" for text in self._waiting.reviews))
-        parts = [playbook, reviews, prompts.DELTAS.format(most=MOST_OPERATIONS)]
+        deltas = prompts.DELTAS.format(most=MOST_OPERATIONS, words=self.answer_tokens // 2)
+        parts = [playbook, reviews, deltas]
         prompt = _prompt(prompts.CURATOR.format(task=task, sections='" or "'.join(SECTIONS)), parts)
         parse = json_of({"operations": list}, repairs=self.repairs)
         answer = await self.services.ask("curate", prompt, self.answer_tokens, parse)

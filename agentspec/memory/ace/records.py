@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from agentspec.memory.ace.playbook import Tag
-
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the reflector says of one bullet."""
+    """What the reflector says of one bullet; a tag that is none of the three says nothing."""
 
     id: str
-    tag: Tag
+    tag: str
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from agentspec.llm.base import system, user
 from agentspec.memory.buffer_of_thought import prompts
 from agentspec.memory.buffer_of_thought.templates import COARSE, Template
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -191,11 +192,11 @@ class BufferOfThought:
         if self.asks:
             prompt = (
                 system(prompts.DISTIL.format(task=self._task(input.instruction))),
-                user(prompts.STATE.format(state=state)),
+                user(prompts.STATE.format(state=state, words=self.answer_tokens // 2)),
             )
             answer = await self.services.ask("distil", prompt, self.answer_tokens)
-            if answer.value and not answer.problem:
-                self._problem = self._looked_up = str(answer.value).strip()
+            self._problem = written(answer, self.answer_tokens, self._count)
+            self._looked_up = self._problem or state
         self._working = self._template_for(self._looked_up)
 
     def _template_for(self, problem: str) -> str:
@@ -231,7 +232,11 @@ class BufferOfThought:
         course = telling.course(finished[1:], self.course_tokens, self._count)
         prompt = (
             system(prompts.TEMPLATE.format(task=self._task(self._done))),
-            user(prompts.EPISODE.format(problem=finished[0][1], steps=telling.STEPS, course=course)),
+            user(
+                prompts.EPISODE.format(
+                    problem=finished[0][1], steps=telling.STEPS, course=course, words=self.answer_tokens // 2
+                )
+            ),
         )
         parse = json_of({"category": str, "description": str, "template": str}, repairs=self.repairs)
         answer = await self.services.ask("template", prompt, self.answer_tokens, parse)

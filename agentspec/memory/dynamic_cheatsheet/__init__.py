@@ -8,8 +8,8 @@ writes the *whole* sheet anew: what it does not copy is lost. The sheet stands v
 - `rs` (retrieval-synthesis): every `every` steps, *before* the action, the `top` past steps most similar to the present
   state are looked up by embedding, and the curator writes the sheet for the present state from the sheet and these,
   the least similar first, each with its similarity. Steps of earlier episodes come before those of the present one,
-  which is what the agent has before its eyes (neighbouring states would fill every place). Where `every` is above 1
-  the curator also reads the steps since the last rewrite, which would pass unseen otherwise.
+  since neighbouring states would fill every place. Where `every` is above 1 the curator also reads the steps since the
+  last rewrite, which would pass unseen otherwise; where it is 1 the agent reads the newest step itself.
 
 AgentSpec's form: a step takes the place of the paper's problem. The steps left at an episode's end are curated with its
 outcome when the next episode of the run begins, so that nothing is asked that no action can profit from, and what is
@@ -270,7 +270,8 @@ class DynamicCheatsheet:
                 self.services.count("truncated")
             return
         self._sheet = self._fit(answer.value, room)
-        self._since, self._lines, self._unseen = [], [], []
+        self._lines = [] if self._since else self._lines[-1:]  # the newest step, where the curator was not told of it
+        self._since, self._unseen = [], []
         self._rewrites += 1
 
     @property

@@ -3,9 +3,10 @@
 Seven stages, in this order:
 
 1. *Normalise*: each step is stamped with its episode and number.
-2. *Compress*: of the state only the share `rate` of its words is kept, the most surprising ones; action and result stay
-   whole. `compressor: unigram` takes surprise from the words seen so far and makes no call; `model` from the language
-   model's own log-probabilities (`score`, one batch per step, no generation).
+2. *Compress*: of the state only the share `rate` of its words is kept, the most surprising ones (a number with its name
+   and unit counts as one); action and result stay whole. `compressor: unigram` takes surprise from the words seen so
+   far and makes no call; `model` from the language model's own log-probabilities (`score`, one batch per step, no
+   generation).
 3. *Sensory buffer*: steps gather until they hold `sensory_tokens`.
 4. *Segment*: the buffer is cut where neighbouring steps are dissimilar; the last topic stays, for it may go on.
 5. *Short-term memory*: topics gather; before they exceed `stm_tokens` one call extracts facts from all of them, each
@@ -31,13 +32,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
-from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising
+from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising, pieces
 from agentspec.memory.parts.entries import (
     STEPS,
     Entries,
@@ -247,14 +249,20 @@ class LightMemory:
     # -- stages ----------------------------------------------------------------------------------------------------
 
     async def _compressed(self, text: str) -> str:
-        """Stage 2: the words of a state that are kept."""
+        """Stage 2: the words of a state that are kept, in its paragraphs."""
         words = text.split()
         self.words.add(words)
         surprisal = self.words.surprisal(words)
         if self.compressor == "model" and words:
             with contextlib.suppress(BudgetExceededError, ContextOverflowError):  # the words seen so far tell, too
                 surprisal = await self._scored(words)
-        return " ".join(keep_surprising(words, surprisal, self.rate))
+        parts = [pieces(part.split()) for part in re.split(r"\n\s*\n", text)]
+        told = [(i, piece) for i, part in enumerate(parts) for piece in part]
+        each = iter(surprisal)
+        most = [max(itertools.islice(each, len(piece))) for _, piece in told]
+        kept = keep_surprising(told, most, self.rate)
+        by_part = itertools.groupby(kept, key=lambda pair: pair[0])
+        return "\n\n".join(" ".join(word for _, piece in part for word in piece) for _, part in by_part)
 
     async def _scored(self, words: list[str]) -> list[float]:
         """Surprise of each word under the model: the difference of two beginnings' log-probabilities."""

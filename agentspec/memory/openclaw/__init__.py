@@ -246,7 +246,7 @@ class OpenClaw:
             steps="\n".join(newest_within(steps, self.steps_tokens, count) + ([ending] if ending else [])),
         )
         self._since = step
-        prompt = head + LEARN.format(most=EDITS)
+        prompt = head + LEARN.format(most=EDITS, words=self.answer_tokens // 2)
         answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits))
         for edit in answer.value.edits[:EDITS] if answer.value else ():
             self._apply(edit)
@@ -303,7 +303,7 @@ class OpenClaw:
         prompt = FLUSH.format(
             task=self._task,
             rules=self._rules_shown(),
-            turns="\n".join(newest_within(turns, 2 * self.steps_tokens, count)),
+            turns="\n".join(newest_within(turns, 2 * self.steps_tokens, count, "turns")),
             most=NOTES,
         )
         answer = await self.services.ask("flush", prompt, self.answer_tokens)

@@ -8,7 +8,8 @@ HEAD = (
 )
 LEARN = (
     "\n\nWhat do these steps teach that the notes lack or have wrong? Edit the notes so that the agent does better: at "
-    "most {most} edits, none if nothing was learnt. `add` or `update` a rule (one sentence: when, what to do, with "
+    "most {most} edits and {words} words in all, none if nothing was learnt. "
+    "`add` or `update` a rule (one sentence: when, what to do, with "
     "numbers), `remove` a rule that proved wrong, or write a `skill` (a procedure of several actions that worked). "
     "Sharpen a rule under its name rather than add a similar one. Answer with JSON:\n"
     '{{"edits": [{{"op": "add" | "update" | "remove" | "skill", "name": short name, "text": the rule or the procedure, '

@@ -67,7 +67,7 @@ def step_name(episode: int, step: int, now: Time) -> str:
     return f"Step {step + 1}" if episode == now.episode else f"Episode {episode + 1}, step {step + 1}"
 
 
-def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) -> list[str]:
+def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens, what: str = "steps") -> list[str]:
     """The newest texts that fit into `tokens`, in order, with a line that says how many older ones do not.
 
     Before a step is left out, the states of all are shortened. Of a single text that is too long the beginning is kept.
@@ -76,7 +76,7 @@ def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) 
         texts = [brief(text, count_tokens) for text in texts]
     kept = newest_that_fit(texts, tokens, count_tokens)
     gone = len(texts) - len(kept)
-    return ([f"({gone} earlier steps are left out)"] if gone else []) + kept
+    return ([f"({gone} earlier {what} are left out)"] if gone else []) + kept
 
 
 def goal_of(instruction: str, count_tokens: CountTokens) -> str:

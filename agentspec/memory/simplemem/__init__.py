@@ -29,7 +29,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
@@ -47,7 +48,7 @@ from agentspec.memory.parts.entries import (
     task_of,
     told,
 )
-from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, WORD, Note, data_of
+from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, WORD, Check, Note, Plan, data_of
 from agentspec.parameters import at_least, settings
 from agentspec.services import Services
 from agentspec.state import dump_state, joined, load_state
@@ -255,8 +256,8 @@ class SimpleMemory:
         if not found:
             return []
         seen = SEEN.format(state=excerpt(state, self.step_tokens, self.services.llm.count_tokens))
-        answer = await self._ask("plan", PLAN, seen, {"queries": list[str]})
-        queries = answer["queries"] if answer else []
+        plan = await self._ask("plan", PLAN, seen, Plan)
+        queries: Sequence[str] = plan.queries if plan else ()
         for check in range(MOST_CHECKS + 1):
             for query in queries[:MOST_QUERIES]:
                 found |= {id: pair for id, pair in self._keyed(self.search(query, k)) if id not in found}
@@ -264,14 +265,14 @@ class SimpleMemory:
                 break
             now = self.services.time()
             notes = "\n".join([NOTES, *(dated(entry, now) for entry, _ in found.values())])
-            answer = await self._ask("check", CHECK, f"{seen}\n\n{notes}", {"enough": bool, "queries": list[str]})
-            queries = answer["queries"] if answer and not answer["enough"] else []
+            said = await self._ask("check", CHECK, f"{seen}\n\n{notes}", Check)
+            queries = said.queries if said and not said.enough else ()
         return list(found.values())
 
     def _keyed(self, found: Iterable[tuple[Entry, float]]) -> list[tuple[int, tuple[Entry, float]]]:
         return [(entry.id, (entry, score)) for entry, score in found]
 
-    async def _ask(self, purpose: str, static: str, dynamic: str, schema: object) -> dict[str, list[str]] | None:
+    async def _ask(self, purpose: str, static: str, dynamic: str, schema: object) -> Any:
         parse = json_of(schema, repairs=self.repairs)
         answer = await self.services.ask(purpose, (system(static), user(dynamic)), self.answer_tokens, parse)
         return answer.value
@@ -331,7 +332,10 @@ class SimpleMemory:
         now = self._window[-1].time
         parts = ["\n".join([NOTES, *(dated(e, now) for e in newest)])] if newest else []
         parts.append(f"{STEPS}\n{told(self._window)}")
-        return (system(COMPRESS.format(task=task, most=self.max_notes)), user("\n\n".join(parts)))
+        return (
+            system(COMPRESS.format(task=task, most=self.max_notes, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _merge(self, added: list[Entry]) -> None:
         """The largest cluster around a new note becomes one note; its members go into the archive."""

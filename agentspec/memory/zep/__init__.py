@@ -276,7 +276,10 @@ class ZepMemory:
         parts = [KNOWN.format(names="; ".join(names))] if names else []
         parts += [EARLIER.format(steps="\n".join(before))] if before else []
         parts.append(f"{STEPS}\n{told(self._pending)}")
-        return (system(EXTRACT.format(task=task, most=self.max_facts)), user("\n\n".join(parts)))
+        return (
+            system(EXTRACT.format(task=task, most=self.max_facts, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _name(self, names: list[str]) -> None:
         """Entities for names: known ones, those the model says they mean, new ones."""
