@@ -214,6 +214,14 @@ def test_a_transcript_of_the_steps_is_not_told_twice() -> None:
     assert "1. WALK() ->" in [r for r in reader.asked if not r.tag.module.startswith("memory.")][-1].messages[-1].text
 
 
+@pytest.mark.parametrize(
+    "written", ["Here is the new sheet:\n\n- a\n- b: c", "The sheet:\n```\n- a\n- b: c\n```", "- a\n- b: c"]
+)
+def test_a_bare_sheet_loses_what_a_model_says_before_it(written: str) -> None:
+    assert read_sheet(written, tags=False) == "- a\n- b: c"
+    assert read_sheet("Prices:\npizza 5", tags=False) == "Prices:\npizza 5"
+
+
 def test_the_newest_step_is_in_sight_where_the_curator_is_not_told_of_it() -> None:
     memory = DynamicCheatsheet(services(Asked(synthesise=SHEET.format("a"))), variant="rs", every=1)
     learn(memory, step(0, "s0"), step(1, "s1"))

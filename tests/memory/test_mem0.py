@@ -144,3 +144,10 @@ def test_nothing_is_asked_when_an_earlier_episode_left_nothing_after_all() -> No
     bench.memory._left = True  # steps were left, and written since, before anything was recalled
     bench.recall("a key")
     assert bench.purposes() == []
+
+
+def test_a_long_answer_of_the_environment_does_not_fill_the_recall() -> None:
+    bench = Bench({"name": "mem0", "recent": 3, "every": 9, "step_tokens": 60}, {})
+    bench.step("a town", "LOOK()", "street\n" * 400)
+    (item,) = bench.recall("a town").items
+    assert item.text.startswith("1. LOOK() -> street street") and len(item.text) <= 60  # a token is a byte here

@@ -52,6 +52,7 @@ PRESETS = {
 HEADER = "Cheat sheet:"
 _TAGS = re.compile(r"<cheatsheet>(.*?)</cheatsheet>", re.DOTALL | re.IGNORECASE)
 _TAG = re.compile(r"</?cheatsheet>", re.IGNORECASE)
+_LEAD = re.compile(r"\A[^\n]*:\s*\n+(?=\s*(?:[-*] |```))")  # "Here is the new sheet:"
 _FENCE = re.compile(r"\A\s*```\w*\n|\n?```\s*\Z")
 
 
@@ -65,7 +66,7 @@ def read_sheet(text: str, tags: bool = True) -> str:
     found = _TAGS.findall(text)
     if not found and (tags or _TAG.search(text)):
         raise ParseError("there is no complete <cheatsheet>...</cheatsheet> in it")
-    sheet = _FENCE.sub("", found[-1] if found else text).strip()
+    sheet = _FENCE.sub("", found[-1] if found else _LEAD.sub("", text.strip())).strip()
     if not sheet:
         raise ParseError("the sheet is empty")
     return str(sheet)

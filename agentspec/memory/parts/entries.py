@@ -54,7 +54,7 @@ class Entry(Record):
 
 @dataclass(frozen=True)
 class Step(Record):
-    """A step that waits to become notes: when it was, told in full, and in one line."""
+    """A step that waits to become notes: when it was, told in full, and in one line; each within a budget."""
 
     time: Time
     text: str
@@ -62,11 +62,12 @@ class Step(Record):
 
     @classmethod
     def of(cls, transition: Transition, services: Services, tokens: int) -> Step:
-        """The step of a transition that has just been made; its text has at most `tokens`."""
+        """The step of a transition that has just been made; its text and its line have at most `tokens` each."""
         now = services.time()
         time = Time(now.episode, transition.step, max(0, now.total - now.step + transition.step))
         seen = Experience.of(transition)
-        return cls(time, seen.block(tokens, services.llm.count_tokens), seen.line())
+        count = services.llm.count_tokens
+        return cls(time, seen.block(tokens, count), clip_text(one_line(seen.line()), tokens, count))
 
     def row(self) -> list[Any]:
         return [numbers(self.time), self.text, self.line]
