@@ -94,7 +94,7 @@ with numbers, ids and names exact and no pronouns; "source" is the number of the
 
 The agent's task: {task}
 
-Answer with JSON: {{"facts": [{{"source": number, "fact": "..."}}]}}, at most {most} facts."""
+Answer with JSON: {{"facts": [{{"source": number, "fact": "..."}}]}}, at most {most} facts and {words} words in all."""
 SLEEP = """\
 You tidy up an agent's notes. Compare one note with later notes that are like it:
 - "update": a later note adds to it or changes it; "text" is what the note shall say from now on;
@@ -317,7 +317,10 @@ class LightMemory:
             for step in steps:
                 parts.append(f"[{number}] {stamp(step.time, newest)}\n{step.text}")
                 number += 1
-        return (system(EXTRACT.format(task=task, most=self.max_facts)), user("\n\n".join(parts)))
+        return (
+            system(EXTRACT.format(task=task, most=self.max_facts, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _sleep(self) -> None:
         """Stage 7: every fact that later facts may change is looked at once per such fact."""

@@ -110,7 +110,7 @@ class OpenClaw:
         promoted: most log entries that are promoted at once.
         max_loss: share of `MEMORY.md`'s rules that a rewrite may lose; one that loses more is refused.
         state_tokens: most tokens of the state kept with a step.
-        answer_tokens: most tokens of each answer.
+        answer_tokens: most tokens of each answer (a rewrite of `MEMORY.md` has twice `memory_tokens`).
         steps_tokens: most tokens of steps in a prompt.
     """
 
@@ -324,8 +324,9 @@ class OpenClaw:
         if not best:
             return
         entries = "\n".join(f"- {self.log[key].text}" for _, key in sorted(best, key=lambda hit: hit[1]))
-        prompt = DREAM.format(rules=self._rules_shown(), entries=entries)
-        answer = await self.services.ask("dream", prompt, self.answer_tokens, json_of({"rules": list[Rule]}))
+        prompt = DREAM.format(rules=self._rules_shown(), entries=entries, words=self.memory_tokens * 2 // 3)
+        room = max(self.answer_tokens, 2 * self.memory_tokens)  # all rules, and the JSON around them
+        answer = await self.services.ask("dream", prompt, room, json_of({"rules": list[Rule]}))
         if answer.value is None:
             return
         rules = {
