@@ -153,7 +153,7 @@ class Mem0Memory:
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         decide: `together` or `each`.
         capacity: most memories.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(

@@ -116,7 +116,7 @@ class CamMemory:
         task_tokens: most tokens of the task's instruction in a prompt.
         repairs: 1 to ask again for a choice that cannot be read, else 0.
         capacity: most steps.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(

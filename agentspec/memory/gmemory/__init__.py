@@ -16,7 +16,7 @@ and so does the learning from the episode before: what no later episode reads is
 strips digits, and merges into a ninth as many rules, by a slip). Success is what the environment says, or a return of
 at least `threshold`; where neither is given, a return above the mean so far (in the first episode above 0). Where
 there are only successes or only failures, these are compared among themselves. Within the first episode of a run the
-memory holds nothing but, in layout `snapshot`, the newest steps. Of the paper's tables this is the row *ReAct +
+memory holds nothing but the newest steps. Of the paper's tables this is the row *ReAct +
 G-Memory* (preset `paper`).
 
 Bounded by `capacity` episodes (the oldest goes first) and `max_insights` rules. An answer that cannot be read: no key
@@ -124,7 +124,7 @@ class GMemory:
         task_tokens: most tokens of the task's instruction.
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most episodes.
-        recent: newest steps shown in layout `snapshot`.
+        recent: newest steps shown, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(

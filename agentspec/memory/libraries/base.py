@@ -88,7 +88,7 @@ class LibraryMemory(ABC):
         top: memories recalled.
         step_tokens: most tokens of a step.
         answer_tokens: most tokens of an answer of the model.
-        recent: newest steps shown with the memories in layout `snapshot`.
+        recent: newest steps shown with the memories, where the prompt does not tell them anyway.
     """
 
     name: ClassVar[str]

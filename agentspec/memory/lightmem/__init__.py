@@ -17,9 +17,9 @@ Seven stages, in this order:
 
 AgentSpec's form: a step takes the place of a dialogue turn. The paper compresses with LLMLingua-2 and also places
 boundaries by attention; neither is to be had from an endpoint, so words are weighed by surprise and boundaries set by
-similarity alone. Sleep happens when the next episode begins, before its first decision. In layout `snapshot` the steps
-that are not yet facts are shown in one line each. Of the paper's tables this is the row *ReAct + LightMem* (preset
-`paper`).
+similarity alone. Sleep happens when the next episode begins, before its first decision. The steps that are not yet
+facts are shown in one line each, where the prompt does not tell them anyway. Of the paper's tables this is the row
+*ReAct + LightMem* (preset `paper`).
 
 Bounded by `capacity` (the fact that is oldest goes first), buffers by their tokens. An extraction that cannot be read
 leaves the topics where they are, up to twice `stm_tokens`; in sleep it leaves the fact alone.
@@ -141,7 +141,7 @@ class LightMemory:
         most_sleep: most facts looked at in one sleep, the newest first (0: no sleep).
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most facts.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(

@@ -117,7 +117,7 @@ class SimpleMemory:
         match_weight: weight of a place or entity that matches.
         plan: whether the model plans retrieval.
         capacity: most notes, and most notes in the archive.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(

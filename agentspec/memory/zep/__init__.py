@@ -120,7 +120,7 @@ class ZepMemory:
         task_tokens: most tokens of the task's instruction in a prompt.
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most facts.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
