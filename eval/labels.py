@@ -28,6 +28,8 @@ Labels = Mapping[str, frozenset[str]]
 """Episode -> the kinds of failure that it shows."""
 
 SAMPLE = Path(__file__).parent / "data" / "failures"
+UNSEEN = SAMPLE.with_name("unseen_failures")
+"""A second sample, played and labelled after the rules had been mended by the first; no rule was mended by it."""
 
 
 @dataclass(frozen=True)

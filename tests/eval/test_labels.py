@@ -11,7 +11,19 @@ import pytest
 from agentspec.failures import LEAVES
 from agentspec.types import Task
 from eval.failures import replayed
-from eval.labels import SAMPLE, Agreement, Sample, agreed, agreement, kappa, kappa_of, main, read_labels, summary
+from eval.labels import (
+    SAMPLE,
+    UNSEEN,
+    Agreement,
+    Sample,
+    agreed,
+    agreement,
+    kappa,
+    kappa_of,
+    main,
+    read_labels,
+    summary,
+)
 from eval.transcripts import transcript
 
 WORLDS = ("deliverybench", "minigrid", "alfred", "robothor")
@@ -113,6 +125,19 @@ def test_precision_recall_and_kappa_of_the_rules(sample: Sample) -> None:
     assert kappa_of(sample.a, sample.b) > 0.8 and kappa_of(rules, sample.a) > 0.8 < kappa_of(rules, sample.b)
     text = (Path(__file__).parents[2] / "docs/evaluation.md").read_text()
     assert summary(sample, rules) in text, "run python -m eval.labels and put what it prints into docs/evaluation.md"
+
+
+def test_the_rules_hold_on_a_sample_that_they_were_not_mended_by() -> None:
+    unseen, seen = Sample.read(UNSEEN), Sample.read(SAMPLE)
+    episodes = [{t.to_json() for t in sample.episodes.values()} for sample in (unseen, seen)]
+    assert len(episodes[0]) == 36 and not episodes[0] & episodes[1]
+    rules = unseen.rules()
+    both, disputed = agreed(unseen.a, unseen.b)
+    whole = sum(agreement(both, rules, disputed).values(), Agreement(0, 0, 0))
+    assert whole.precision is not None and whole.recall is not None
+    assert whole.precision >= 0.85 and whole.recall >= 0.8
+    text = (Path(__file__).parents[2] / "docs/evaluation.md").read_text()
+    assert summary(unseen, rules) in text, "run python -m eval.labels eval/data/unseen_failures and put it there"
 
 
 def test_the_command_prints_it_and_judges_other_answers(
