@@ -63,15 +63,19 @@ def render_actions(schema: ActionSchema) -> str:
     return "\n".join(lines)
 
 
-def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "") -> str:
+def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "", steps: int = 0) -> str:
     """Lessons and memory within the spec's budgets, a method's own transcript of the steps, then the observation.
 
     Steps that the transcript or the conversation tells are not told again by a memory (items of kind `step` and
     `failure`, one for each of the newest steps); of a conversation's, failures stay whose reason it does not give.
+
+    Args:
+        transcript: what a method itself tells of the newest `steps` steps.
     """
     services.context.transcript = transcript
     if transcript:
-        recall = Recall(tuple(item for item in recall.items if item.kind not in STEPS))
+        told = [i for i, item in enumerate(recall.items) if item.kind in STEPS][-steps:]
+        recall = Recall(tuple(item for i, item in enumerate(recall.items) if i not in told))
         transcript = TRANSCRIPT.format(text=transcript)
     elif services.context.told:
         recall = _untold(recall, services, input.text)

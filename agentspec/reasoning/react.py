@@ -90,8 +90,8 @@ class ReAct:
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         menu = bool(input.action_schema.choices)
         snapshot = self.services.context.layout == "snapshot"
-        transcript = "\n".join(self._transcript[-self.history :]) if snapshot else ""
-        dynamic = user_turn(input, recall, self.services, transcript=transcript)
+        told = self._transcript[-self.history :] if snapshot else []
+        dynamic = user_turn(input, recall, self.services, transcript="\n".join(told), steps=len(told))
         messages = self.services.context.prompt(static_prompt(input, FORMAT_MENU if menu else FORMAT), dynamic)
         return await self._loop(input, messages)
 
