@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import append_lines, digest, jsonable, parse_line, repair_lines, whole_lines, write_atomic
+from agentspec.llm.pricing import Prices
 from agentspec.registry import SpecError
+from eval.repricing import repriced
 
 EPISODES = "episodes.jsonl"
 LOCK = ".lock"
@@ -31,13 +33,14 @@ class Store:
 
     Args:
         folder: where they are kept; made when the first one is added.
+        prices: what episodes cost when they are read; `None`: what they cost when they were played.
 
     Raises:
         ValueError: a line that is no record of an episode, with its number.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | Path, prices: Prices | None = None) -> None:
+        self.folder, self.prices = Path(folder), prices
         self.path = self.folder / EPISODES
         self._records: dict[str, Record] = {}
         self._configurations: dict[str, str] = {}
@@ -76,8 +79,9 @@ class Store:
             ) from None
 
     def get(self, key: str) -> Record | None:
-        """The episode that counts under `key`."""
-        return self._records.get(key)
+        """The episode that counts under `key`, at the store's prices."""
+        record = self._records.get(key)
+        return record if record is None or self.prices is None else repriced(record, self.prices)
 
     def __len__(self) -> int:
         return len(self._records)

@@ -44,7 +44,8 @@ FORMAT_MENU = (
     "listed actions, word for word."
 )
 ACKNOWLEDGED = "OK."
-STOP = ("\nObservation:", "Observation:")
+STOP = ("\nObservation:",)
+"""Not where an answer begins with it: a model that first says what it sees would be stopped before its first word."""
 
 
 class ReAct:
@@ -89,8 +90,8 @@ class ReAct:
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         menu = bool(input.action_schema.choices)
         snapshot = self.services.context.layout == "snapshot"
-        transcript = "\n".join(self._transcript[-self.history :]) if snapshot else ""
-        dynamic = user_turn(input, recall, self.services, transcript=transcript)
+        told = self._transcript[-self.history :] if snapshot else []
+        dynamic = user_turn(input, recall, self.services, transcript="\n".join(told), steps=len(told))
         messages = self.services.context.prompt(static_prompt(input, FORMAT_MENU if menu else FORMAT), dynamic)
         return await self._loop(input, messages)
 
@@ -112,7 +113,9 @@ class ReAct:
                 return self._decision(Acted(reading, call, tuple(calls)), words)
             reply = ACKNOWLEDGED
             meant = isinstance(reading.action, ActionError) and (
-                reading.explicit or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                reading.explicit
+                or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                or not visible(call.text)[0]  # nothing is no thought
             )
             if meant and retries and not schema.choices:
                 assert isinstance(reading.action, ActionError)
