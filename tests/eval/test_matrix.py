@@ -354,8 +354,8 @@ def test_a_lost_memory_stops_its_own_cell_and_says_so(tmp_path: Path) -> None:
 
 
 def test_one_checkpoint_given_twice_is_not_two_training_runs(tmp_path: Path) -> None:
-    runs = [Policy("trained", model, run=str(i)) for i, model in enumerate(("m", "n", "m"))]
-    with pytest.raises(SpecError, match=r"'trained': two of its training runs \(0, 1, 2\) have the same weights"):
+    runs = [Policy("seller", model, run=str(i)) for i, model in enumerate(("m", "n", "m"))]
+    with pytest.raises(SpecError, match=r"'seller': two of its training runs \(0, 1, 2\) have the same weights"):
         play(tmp_path, policies=runs)
     # Who knows that they are several runs, which have learnt nothing, counts each: the episodes are kept once.
     rows, _ = play(tmp_path, policies=runs, specs={"plain": PLAIN}, twins=True)
