@@ -31,7 +31,7 @@ from agentspec.prompting import (
 from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
-from agentspec.tokens import clip_text
+from agentspec.tokens import excerpt, news
 from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
 from agentspec.visible import visible
 
@@ -56,7 +56,7 @@ class ReAct:
         thought_tokens: most tokens of a thought (`None`: the spec's `max_tokens`).
         history: steps of transcript shown in the `snapshot` layout.
         max_retries: further calls for an action that cannot be read.
-        observation_tokens: most tokens of each observation in that transcript, after what the environment said.
+        observation_tokens: most tokens of each observation in that transcript, of what is new in it.
     """
 
     declaration = Declaration(
@@ -83,9 +83,10 @@ class ReAct:
         self.max_retries = max_retries
         self.observation_tokens = observation_tokens
         self._transcript: list[str] = []
+        self._before = ["", ""]  # the observation that was told last, and what came of the action then
 
     def begin_episode(self, task: Task) -> None:
-        self._transcript = []
+        self._transcript, self._before = [], ["", ""]
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         menu = bool(input.action_schema.choices)
@@ -147,16 +148,18 @@ class ReAct:
         thought = " ".join(thought.split()).removeprefix("Thought:").strip()
         self._see(transition.input.text)
         result = transition.info.get("error") or transition.info.get("message") or "done"
+        self._before = [transition.input.text, str(result)]
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
 
     def _see(self, observation: str) -> None:
         """Add to the step before what was observed after it; the newest observation stands in the prompt whole."""
-        if self._transcript and self.observation_tokens and self.services.context.layout == "snapshot":
-            seen = " ".join(observation.split())
-            self._transcript[-1] += f" | {clip_text(seen, self.observation_tokens, self.services.llm.count_tokens)}"
+        if not (self._transcript and self.observation_tokens and self.services.context.layout == "snapshot"):
+            return
+        if fresh := news(observation, *self._before):
+            self._transcript[-1] += f" | {excerpt(fresh, self.observation_tokens, self.services.llm.count_tokens)}"
 
     def snapshot(self) -> bytes:
-        return dump_state(self._transcript)
+        return dump_state([self._before, self._transcript])
 
     def restore(self, blob: bytes) -> None:
-        self._transcript = load_state(blob)
+        self._before, self._transcript = load_state(blob)
