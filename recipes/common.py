@@ -33,8 +33,8 @@ def train_and_draw(config: Any, **how: Any) -> Any:
     trainer = train(config, **how)
     trainer.accelerator.wait_for_everyone()
     if config.plots and trainer.accelerator.is_main_process:
+        from agentspec.records.folder import METRICS
         from eval.plots import reward_curve
-        from trainers.run_folder import METRICS
 
         reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png", unit=unit(config))
     return trainer

@@ -19,14 +19,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from agentspec.files import digest, file_digest, write_atomic
+from agentspec.files import digest, file_digest, read_lines, write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
+from agentspec.records.folder import MANIFEST as RUN_MANIFEST
+from agentspec.records.folder import METRICS, checkpoints
 from agentspec.registry import SpecError
 from agentspec.trajectory import versions
 from trainers.card import FILE, model_card
-from trainers.run_folder import MANIFEST as RUN_MANIFEST
-from trainers.run_folder import METRICS, checkpoints
-from trainers.runlog import RunLog
 
 MANIFEST = "agentspec.json"
 FORMAT = 1
@@ -206,7 +205,7 @@ def _manifest(
         "template_sha256": _template_sha256(work),
         "tokenizer_sha256": file_digest(tokenizer) if tokenizer.is_file() else "",
         "versions": {"export": versions() | more, "training": recorded.get("versions", {})},
-        "rewards": reward_summary(RunLog(run).read(METRICS)),
+        "rewards": reward_summary(read_lines(run / METRICS)),
     }
 
 

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
+from agentspec.records.digests import short_digest
+from agentspec.records.folder import FORMAT
 from trainers.credit import FIELDS
-from trainers.digests import short_digest
-from trainers.runlog import FORMAT
 from trainers.sequences import Row
 
 LOSS_SETTINGS = (

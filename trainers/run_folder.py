@@ -1,4 +1,4 @@
-"""The folder of a run: what lies in it, and that one run at a time writes into it.
+"""One run at a time writes into a folder.
 
 A run that begins where an earlier one was moves *everything* of that one together into `earlier/N`: its manifest, logs,
 trajectories and checkpoints belong to each other and to no other run.
@@ -18,6 +18,16 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TextIO
 
+from agentspec.records.folder import (
+    CHECKPOINT,
+    EVALUATIONS,
+    MANIFEST,
+    MANIFESTS,
+    METRICS,
+    SEAL,
+    TRAJECTORIES,
+    UPDATES,
+)
 from agentspec.registry import SpecError
 
 try:
@@ -25,33 +35,7 @@ try:
 except ImportError:  # no POSIX system
     fcntl = None  # type: ignore[assignment]
 
-LOCK = "run.lock"
-MANIFEST = "manifest.json"
-MANIFESTS = "manifests"
-UPDATES = "updates.jsonl"
-METRICS = "metrics.jsonl"
-EVALUATIONS = "evaluations.jsonl"
-TRAJECTORIES = "trajectories"
-SEAL = "seal.json"
-EARLIER = "earlier"
-CHECKPOINT = "checkpoint"
-STATE, TRAINER_STATE = "scaffold_state.json", "trainer_state.json"
-
-
-def checkpoints(folder: str | Path) -> list[Path]:
-    """The checkpoints of a run that were written to their end, oldest first.
-
-    A run that was killed while saving leaves a folder without its last file, or (rotation cut short) without its
-    trainer state; both are passed over.
-    """
-    found = {path.name.rpartition("-")[2]: path for path in Path(folder).glob(f"{CHECKPOINT}-*")}
-    ordered = [found[number] for number in sorted(filter(str.isdigit, found), key=int)]
-    return [path for path in ordered if (path / STATE).is_file() and (path / TRAINER_STATE).is_file()]
-
-
-def last_complete_checkpoint(folder: str | Path) -> Path | None:
-    """The newest of `checkpoints`; `None` if there is none."""
-    return next(reversed(checkpoints(folder)), None)
+LOCK, EARLIER = "run.lock", "earlier"
 
 
 def holds_run(folder: str | Path) -> bool:

@@ -1,19 +1,4 @@
-"""What a run leaves behind, each file a link of one chain.
-
-    runs/quickstart/
-        manifest.json             config, spec, versions, command
-        manifests/000000.json     those before it: a resumed run has a new one, which names the digest of the one before
-        trajectories/000001.jsonl one file per generation round
-        updates.jsonl             one receipt per generation round (`trainers.receipts`)
-        memory.json               with `scope: run`: the memories that tasks carry on (`agentspec.carry`)
-        metrics.jsonl             what the trainer logged
-        evaluations.jsonl         what evaluation while training found (`eval_strategy: steps`)
-        seal.json                 written when the run ends: its digest is the head of the chain
-
-A receipt holds the digests of its round's trajectory files, of the memory after it, of the manifest and of the receipt
-before it; the seal those of all these files, and of each of their lines. Whoever keeps the head can tell any later
-edit. Without it, an edit is told as long as its author does not compute every digest after it anew.
-"""
+"""The records of a run as they are written (`agentspec.records`): manifest, episodes, receipts, logs, seal."""
 
 from __future__ import annotations
 
@@ -23,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agentspec.carry import FILE as MEMORY
 from agentspec.files import (
     append_lines,
     digest,
@@ -35,14 +19,25 @@ from agentspec.files import (
     whole_lines,
     write_atomic,
 )
+from agentspec.records.chain import seal_of
+from agentspec.records.digests import field_digests
+from agentspec.records.folder import (
+    EVALUATIONS,
+    FORMAT,
+    MANIFEST,
+    MANIFESTS,
+    MEMORY,
+    METRICS,
+    SEAL,
+    STATE,
+    TRAJECTORIES,
+    UPDATES,
+    checkpoints,
+    digest_of,
+    round_files,
+)
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, versions
-from trainers import run_folder
-from trainers.digests import field_digests
-from trainers.run_folder import EVALUATIONS, MANIFEST, MANIFESTS, METRICS, SEAL, TRAJECTORIES, UPDATES
-
-FORMAT = 4
-SEALED = (MANIFEST, UPDATES, MEMORY, METRICS, EVALUATIONS)
 
 
 class RunLog:
@@ -145,25 +140,6 @@ class RunLog:
         for path in round_files(self.folder):
             if int(path.name[:6]) >= step:
                 path.unlink()
-        for path in run_folder.checkpoints(self.folder):
+        for path in checkpoints(self.folder):
             if int(path.name.rpartition("-")[2]) > step:
-                (path / run_folder.STATE).unlink()  # without its records nobody may go on from it
-
-
-def round_files(folder: Path) -> list[Path]:
-    """The trajectory files of all rounds, in `trajectories` and in every other folder of the run that has some."""
-    return sorted(p for p in folder.glob("*/[0-9][0-9][0-9][0-9][0-9][0-9]*.jsonl") if p.is_file())
-
-
-def digest_of(path: Path) -> str:
-    """Digest of a file; empty if there is none."""
-    return file_digest(path) if path.is_file() else ""
-
-
-def seal_of(folder: Path) -> str:
-    """The seal of a folder as it is: of every record its digest and, of a file of lines, 16 digits of each line's."""
-    files = {}
-    for path in (folder / name for name in SEALED if (folder / name).is_file()):
-        lines = [digest(line)[:16] for _, line in whole_lines(path)] if path.suffix == ".jsonl" else []
-        files[path.name] = {"digest": file_digest(path), "lines": lines}
-    return json.dumps({"format": FORMAT, "files": files}, indent=1, sort_keys=True) + "\n"
+                (path / STATE).unlink()  # without its records nobody may go on from it

@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
+from agentspec.records.folder import checkpoints, last_complete_checkpoint
 from agentspec.registry import SpecError
 from trainers import run_folder
-from trainers.run_folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
+from trainers.run_folder import LOCK, hold, holds_run, set_aside
 
 HOLDER = """
 import sys
