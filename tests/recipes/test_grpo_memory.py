@@ -21,7 +21,7 @@ from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.counterfactuals import FOLDER
-from trainers.memory import as_memory
+from trainers.presets import as_memory
 from trainers.runlog import RunLog
 from trainers.writes import WRITE_CREDITS
 

@@ -27,9 +27,9 @@ from trainers.audit import audit
 from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, is_overlong
+from trainers.presets import as_supo
 from trainers.runlog import RunLog
 from trainers.sequences import build_sequences
-from trainers.supo import as_supo
 
 SUPO = {
     "agent": {"reasoning": "direct", "memory": {"name": "summary", "every": 3}},
