@@ -18,6 +18,7 @@ pytest.importorskip("trl")
 from trl import GRPOConfig
 
 from agentspec.episode import Job, Runner
+from agentspec.extends import merged
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.prompting import static_prompt
 from agentspec.reasoning.react import FORMAT
@@ -27,7 +28,7 @@ from agentspec.spec import AgentSpec
 from agentspec.types import Task
 from recipes.common import CONFIGS, run_recipe
 from trainers.ahead import KNOWN, OURS
-from trainers.arguments import merged, parse_config, read_config
+from trainers.arguments import parse_config, read_config
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
 from trainers.run import train

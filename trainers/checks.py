@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
 from agentspec.actions import suggest
@@ -17,7 +17,6 @@ from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
 from trainers.estimators import ESTIMATORS
-from trainers.fields import REFUSED
 from trainers.losses import LOSSES, loss
 from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.unread import REFLECTION, unread_with_a_value
@@ -66,19 +65,6 @@ def check(config: ScaffoldConfig) -> None:
     for found in (_values, unread_with_a_value, _calls, _writes, _rounds, _vllm):
         for problem in found(config):
             raise SpecError(problem)
-
-
-def check_given(names: Iterable[str], where: str) -> None:
-    """Refuse fields that a user names and nobody reads, whatever their value.
-
-    Args:
-        names: keys of a YAML file, or options of a command line.
-        where: what they were read from, for the message.
-    """
-    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
-    for name in names:
-        if name in why:
-            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:
