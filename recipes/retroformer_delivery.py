@@ -38,13 +38,6 @@ def main() -> None:
         evaluate_run(config, Path(config.output_dir))
 
 
-def _unscored(runner: Any, jobs: Any) -> list[Any]:
-    """The jobs' episodes; their returns are read off the metrics, so nothing scores them."""
-    from trainers.credit import ScoredEpisode
-
-    return [ScoredEpisode(trajectory, None) for trajectory in runner.run(jobs)]
-
-
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     """Two trials of every held-out task with each reflector and without one (`CONTROL`): rows, also in `folder`."""
     from agentspec.episode import Job, Runner
@@ -53,7 +46,7 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     from agentspec.tasks import make_tasks
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import ADAPTERS, has_lesson, play_trials
-    from trainers.rollouts import local_llm
+    from trainers.rollouts import collect, local_llm
 
     name, options = config.world
     jobs = [Job(task, 0, config.seed) for task in make_tasks(name, options, config.eval_tasks, split="test")]
@@ -67,7 +60,7 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
         runner = Runner(
             agent, local_llm(model, tokenizer, adapters=ADAPTERS), timeout_s=config.env_timeout_s, policy=label
         )
-        played = play_trials(partial(_unscored, runner), jobs)
+        played = play_trials(partial(collect, runner, rewards=config.reward_set), jobs)
         firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):
             returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]

@@ -16,9 +16,9 @@ from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
+from agentspec.tags import matches
 from trainers.estimators import ESTIMATORS
 from trainers.losses import LOSSES, loss
-from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.unread import REFLECTION, unread_with_a_value
 from trainers.writes import write_credit
 
@@ -96,7 +96,7 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
         if not getattr(config, name):
             yield f"{name} is empty, so nothing would be trained; name some, or leave the field out"
     for name, patterns in (("train_calls", config.train_calls), ("mask_truncated", config.mask_truncated)):
-        if missing := unmatched_patterns(paths, TrainFilter(tuple(patterns))):
+        if missing := [p for p in patterns if not any(matches(path, p) for path in paths)]:
             there = ", ".join(sorted(set(paths))) or "none (no module calls the model)"
             yield f"{name} {missing} match no call of this scaffold, so they would change nothing; its calls: {there}"
     temperatures = {"sampling.temperature": spec.sampling.temperature}
@@ -140,8 +140,8 @@ def _writes(config: ScaffoldConfig) -> Iterator[str]:
             f"write_credit {spec.name!r} with roles {list(roles)}: an episode is played again from its recorded "
             "answers, and those of helper models are not given back; use `write_credit: ablation`, or no helper"
         )
-    paths, writes = own_memory_paths(config), TrainFilter(tuple(config.write_calls))
-    if not any(config.train_filter.matches(p) and writes.matches(p) for p in paths):
+    paths = own_memory_paths(config)
+    if not any(config.train_filter.matches(p) and matches(p, config.write_calls) for p in paths):
         yield (
             f"write_credit {spec.name!r}, but no call of memory {config.spec.memory.name!r} is both trained "
             f"(train_calls {config.train_calls}) and a write (write_calls {config.write_calls}); its calls are "

@@ -3,8 +3,8 @@
 A run that begins where an earlier one was moves *everything* of that one together into `earlier/N`: its manifest, logs,
 trajectories and checkpoints belong to each other and to no other run.
 
-The operating system holds the folder's lock (`flock`), so that it is gone when its holder is, however that ended. The
-file stays, since whoever removed it could not know who had opened it; it names its holder while there is one.
+The operating system holds the folder's lock, so that it is gone when its holder is, however that ended. The file stays,
+and names its holder while there is one.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextvars import ContextVar
 from pathlib import Path
-from typing import TextIO
+
+from filelock import FileLock, Timeout
 
 from agentspec.records.folder import (
     CHECKPOINT,
@@ -29,11 +29,6 @@ from agentspec.records.folder import (
     UPDATES,
 )
 from agentspec.registry import SpecError
-
-try:
-    import fcntl
-except ImportError:  # no POSIX system
-    fcntl = None  # type: ignore[assignment]
 
 LOCK, EARLIER = "run.lock", "earlier"
 
@@ -84,9 +79,6 @@ def _is_output(path: Path) -> bool:
     return False
 
 
-_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
-
-
 @contextlib.contextmanager
 def hold(folder: str | Path) -> Iterator[None]:
     """The folder belongs to this run inside; within a block that holds it already, nothing happens.
@@ -95,38 +87,19 @@ def hold(folder: str | Path) -> Iterator[None]:
         SpecError: another run holds it: which, and what to do.
     """
     path = Path(folder).resolve() / LOCK
-    if path in _held.get():
-        yield
-        return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+", encoding="utf-8") as file:
-        _lock(file)
-        _write(file, f"process {os.getpid()} on {socket.gethostname()}")
-        token = _held.set(_held.get() | {path})
-        try:
-            yield
-        finally:
-            _held.reset(token)
-            _write(file, "")
-
-
-def _lock(file: TextIO) -> None:
+    lock = FileLock(path, timeout=0, is_singleton=True)  # one object per path, which its thread may acquire again
     try:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-    except (BlockingIOError, PermissionError):
-        file.seek(0)
-        folder, who = Path(file.name).parent, file.read() or "it is starting or ending"
+        lock.acquire()
+    except Timeout:
+        who = path.read_text(encoding="utf-8") or "it is starting or ending"
         raise SpecError(
-            f"{folder} belongs to a run that is under way ({who}); choose another output_dir, or wait for its end"
+            f"{path.parent} belongs to a run that is under way ({who}); choose another output_dir, or wait for its end"
         ) from None
-    except OSError:
-        pass
-    print(f"note: {file.name} cannot be locked here; see that no second run writes into its folder", file=sys.stderr)
-
-
-def _write(file: TextIO, text: str) -> None:
-    file.truncate(0)
-    file.write(text)
-    file.flush()
+    try:
+        path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        if lock.lock_counter == 1:  # the outermost block
+            path.write_text("", encoding="utf-8")
+        lock.release()
