@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.records.chain import check_end, files_of, linked_receipts, manifest_of, read_manifests, read_round
+from agentspec.records.completions import check_completions
 from agentspec.records.folder import MANIFEST, TRAJECTORIES, UPDATES
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
@@ -27,7 +28,7 @@ from trainers.counterfactuals import attach
 from trainers.credit import CreditRule
 from trainers.estimators import estimator
 from trainers.losses import UpdateSize, loss
-from trainers.provenance import check_completion, check_tokens
+from trainers.provenance import check_tokens
 from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.run_folder import holds_run
 from trainers.sequences import Row
@@ -232,7 +233,5 @@ def check_samples(rows: Sequence[Row], episodes: Sequence[Trajectory], problems:
         problems += found
         by_tag += counted
     for t in episodes:
-        for call in t.calls:
-            for completion in call.completions:
-                problems += check_completion(completion, f"call {call.id} of {t.episode}")
+        problems += check_completions(t)
     return by_tag

@@ -2,22 +2,16 @@
 
 A run that begins where an earlier one was moves *everything* of that one together into `earlier/N`: its manifest, logs,
 trajectories and checkpoints belong to each other and to no other run.
-
-The operating system holds the folder's lock, so that it is gone when its holder is, however that ended. The file stays,
-and names its holder while there is one.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import socket
 import sys
-from collections.abc import Iterator
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
+from agentspec.files import held
 from agentspec.records.folder import (
     CHECKPOINT,
     EVALUATIONS,
@@ -28,7 +22,6 @@ from agentspec.records.folder import (
     TRAJECTORIES,
     UPDATES,
 )
-from agentspec.registry import SpecError
 
 LOCK, EARLIER = "run.lock", "earlier"
 
@@ -73,33 +66,13 @@ def set_aside(folder: str | Path) -> Path | None:
 def _is_output(path: Path) -> bool:
     """Whether this process's standard output or error is written to the file."""
     for number in (1, 2):
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             if os.path.samestat(os.fstat(number), path.stat()):
                 return True
     return False
 
 
-@contextlib.contextmanager
-def hold(folder: str | Path) -> Iterator[None]:
-    """The folder belongs to this run inside; within a block that holds it already, nothing happens.
-
-    Raises:
-        SpecError: another run holds it: which, and what to do.
-    """
-    path = Path(folder).resolve() / LOCK
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path, timeout=0, is_singleton=True)  # one object per path, which its thread may acquire again
-    try:
-        lock.acquire()
-    except Timeout:
-        who = path.read_text(encoding="utf-8") or "it is starting or ending"
-        raise SpecError(
-            f"{path.parent} belongs to a run that is under way ({who}); choose another output_dir, or wait for its end"
-        ) from None
-    try:
-        path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
-        yield
-    finally:
-        if lock.lock_counter == 1:  # the outermost block
-            path.write_text("", encoding="utf-8")
-        lock.release()
+def hold(folder: str | Path) -> AbstractContextManager[None]:
+    """The folder belongs to this run inside, or (`SpecError`) to another one (`agentspec.files.held`)."""
+    refusal = f"{folder} belongs to a run that is under way"
+    return held(Path(folder) / LOCK, refusal, "choose another output_dir, or wait for its end", again=True)
