@@ -18,15 +18,10 @@ CONFIGS = Path(__file__).parent / "configs"
 
 
 def train_and_draw(config: Any, **how: Any) -> Any:
-    """Train, and draw the reward curve as `reward_curve.png` in the run's folder (if the config asks for plots).
+    """Train (`trainers.run.train`), and draw the reward curve into the run's folder if the config asks for plots.
 
-    Torch and TRL are imported only here: what is wrong with a configuration has been told by then.
-
-    Args:
-        how: as of `trainers.run.train`.
-
-    Returns:
-        the trainer, when all processes are through.
+    Torch and TRL are imported only here: what is wrong with a configuration has been told by then. The trainer is given
+    back when all processes are through.
     """
     from trainers.run import train
 

@@ -97,11 +97,7 @@ def structure(value: Any) -> Any:
 
 
 def check_world(value: Any) -> tuple[str, dict[str, Any]]:
-    """Name and options of an environment that exists and takes them.
-
-    Raises:
-        SpecError: not of the form `{name: ..., options: {...}}`, an unknown name or option.
-    """
+    """Name and options of an environment that exists and takes them; else a `SpecError`."""
     given: Any = {"name": value} if isinstance(value, str) else value
     if not isinstance(given, Mapping) or not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
         raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")

@@ -51,15 +51,7 @@ def parse_config(argv: Sequence[str] | None = None, *, default: str | Path) -> S
 
 
 def read_config(path: str | Path, *, shelf: Path | None = None) -> dict[str, Any]:
-    """The fields that a YAML file gives, with those of the files it extends.
-
-    Args:
-        path: a file, or the name of one in `shelf`, with or without `.yaml`.
-        shelf: folder of the configurations that can be given by name.
-
-    Raises:
-        SpecError: malformed YAML, an unknown key, or a field that nobody reads.
-    """
+    """The fields that a YAML file gives (`agentspec.extends.read_extended`), all of which exist and are read."""
     data = read_extended(path, shelf)
     check_names(data, str(path))
     return data

@@ -54,11 +54,7 @@ RANGES: dict[tuple[float, float], str] = {
 
 
 def check(config: ScaffoldConfig) -> None:
-    """Refuse what cannot work, would not be exact, or would change nothing.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what cannot work, would not be exact, or would change nothing."""
     _ = config.reward_set, config.world, config.other_specs, config.starting_memory, config.evaluation_specs
     AgentSpec.from_data({"sampling": config.evaluation_sampling})
     check_reporters(config)
@@ -198,11 +194,7 @@ def _vllm(config: ScaffoldConfig) -> Iterator[str]:
 
 
 def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what does not train a reflector beside a frozen actor."""
     for problem in _retroformer(config):
         raise SpecError(problem)
 

@@ -43,11 +43,7 @@ def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) 
 def play_beside(
     runner: Runner, jobs: Sequence[Job], episodes: Sequence[ScoredEpisode], rule: CreditRule, *, retries: int = 0
 ) -> list[ScoredEpisode]:
-    """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants.
-
-    Args:
-        retries: as of `trainers.rollouts.collect`: a repeated episode had another seed.
-    """
+    """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants."""
     wanted = [
         (i, plan, _job(job, episode.trajectory, retries))
         for i, (job, episode) in enumerate(zip(jobs, episodes, strict=True))

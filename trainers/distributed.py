@@ -27,11 +27,7 @@ from trainers.sequences import TrainFilter, trained_completions
 
 
 def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:
-    """Refuse a parallel layout that this configuration would hang in.
-
-    Raises:
-        SpecError: what cannot work under sharded weights, why, and what to set.
-    """
+    """Refuse (`SpecError`) a parallel layout that this configuration would hang in."""
     layout = DistributedBackend(accelerator)
     if not layout.is_fsdp and not layout.is_zero3:
         return

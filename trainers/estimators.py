@@ -166,11 +166,7 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
 
 
 def estimator(name: str) -> EstimatorSpec:
-    """The row of `name`.
-
-    Raises:
-        SpecError: no such estimator.
-    """
+    """The row of `name`; `SpecError` with the nearest names if there is none."""
     if name not in ESTIMATORS:
         raise SpecError(f"unknown estimator {name!r}{suggest(name, ESTIMATORS)}")
     return ESTIMATORS[name]

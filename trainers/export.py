@@ -47,20 +47,17 @@ class Trained:
 
 
 def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
-    """Write the trained policy of `run` to `to`, whole or not at all.
+    """Write the trained policy of `run` to `to`, which is given back, whole or not at all.
 
     Args:
-        run: output folder of training: its final model, else its last complete checkpoint.
-        to: folder to write; must not exist, or be empty.
-        merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
-            `transformers` reads the result. A run that trained all weights is a whole model either way.
-
-    Returns:
-        `to`.
+    run: output folder of training: its final model, else its last complete checkpoint.
+    to: folder to write; must not exist, or be empty.
+    merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
+        `transformers` reads the result. A run that trained all weights is a whole model either way.
 
     Raises:
-        SpecError: there are no weights in `run`, or `to` holds something.
-        ModelNotFoundError: the base model that an adapter needs cannot be found.
+    SpecError: there are no weights in `run`, or `to` holds something.
+    ModelNotFoundError: the base model that an adapter needs cannot be found.
     """
     run, to = Path(run), Path(to)
     trained = find_trained(run)
@@ -96,11 +93,7 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
 
 
 def find_trained(run: Path) -> Trained:
-    """The final weights of a run, or those of its last complete checkpoint.
-
-    Raises:
-        SpecError: there is no such folder, or no safetensors weights in it.
-    """
+    """The final weights of a run, or those of its last complete checkpoint; `SpecError` without either."""
     if not run.is_dir():
         raise SpecError(f"no run folder {run}; give the output_dir of a training run")
     for folder in (run, *reversed(checkpoints(run))):

@@ -28,10 +28,6 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
 
     float32 on a CPU (bfloat16 is slower there), bfloat16 where the config says `bf16`. With `lora_r: 0` all
     weights are trained.
-
-    Raises:
-        LLMError: the model or adapter cannot be found.
-        SpecError: the adapter of a frozen actor is named.
     """
     if config.actor_adapter:
         raise SpecError(
@@ -45,12 +41,9 @@ def load_actor_and_reflector(config: ScaffoldConfig, run: str | Path = "") -> tu
     """One base with two adapters, and the tokenizer: the actor's, frozen, and the reflector's, active and trainable.
 
     Args:
-        config: `actor_adapter` is the actor's (empty: a LoRA that nobody trains adds nothing, so the base model acts),
-            `adapter` what the reflector starts from (empty: a new LoRA, which says what the base model says).
-        run: folder of a training run or of its checkpoint: both adapters come from there.
-
-    Raises:
-        LLMError: the model or an adapter cannot be found.
+    config: `actor_adapter` is the actor's (empty: a LoRA that nobody trains adds nothing, so the base model acts),
+        `adapter` what the reflector starts from (empty: a new LoRA, which says what the base model says).
+    run: folder of a training run or of its checkpoint: both adapters come from there.
     """
     if run:
         return _load(config, {ACTOR: str(Path(run) / ACTOR), TRAINED: str(run)})
@@ -58,7 +51,11 @@ def load_actor_and_reflector(config: ScaffoldConfig, run: str | Path = "") -> tu
 
 
 def _load(config: ScaffoldConfig, adapters: Mapping[str, str]) -> tuple[nn.Module, Any]:
-    """The base model with its tokenizer, and on it adapters by name, each from where it says or (empty) a new one."""
+    """The base model with its tokenizer, and on it adapters by name, each from where it says or (empty) a new one.
+
+    Raises:
+    LLMError: the model or an adapter cannot be found.
+    """
     from peft import PeftModel, get_peft_model
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
@@ -95,11 +92,7 @@ def _load(config: ScaffoldConfig, adapters: Mapping[str, str]) -> tuple[nn.Modul
 
 
 def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
-    """Configuration of a new adapter for `model`.
-
-    Raises:
-        SpecError: more layers than the model has.
-    """
+    """Configuration of a new adapter for `model`, which has such modules and as many layers (else `SpecError`)."""
     from peft import LoraConfig
 
     layers = model.config.get_text_config().num_hidden_layers
@@ -117,11 +110,7 @@ def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
 
 
 def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
-    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection.
-
-    Raises:
-        SpecError: the model has no such module.
-    """
+    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection."""
     names = [name for name, _ in model.named_modules()]
     if config.lora_targets != ["all-linear"]:
         there = {name.rpartition(".")[2] for name in names}

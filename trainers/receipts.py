@@ -65,13 +65,7 @@ def receipt_record(
     denominator: int,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """A receipt but for its chain.
-
-    Args:
-        round: number of the generation round: optimiser steps before it.
-        played: id and return of every episode of the round.
-        rows: of all ranks, as of `receipt_rows`.
-    """
+    """A receipt but for its chain: `played` are id and return of every episode, `rows` those of all ranks."""
     return {
         "format": FORMAT,
         "round": round,

@@ -47,13 +47,10 @@ FIRST_TRIALS = "first_trials"
 
 
 def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
-    """Make `config` train the reflector, and nothing else.
+    """Make `config` train the reflector, and nothing else; `SpecError` where it says otherwise.
 
     The agent's reflection becomes `retroformer` with `when: start` and its scope `run`; the lessons are the
     trained calls; the reward, unless one is given, is the change of return.
-
-    Raises:
-        SpecError: what is configured says otherwise (`trainers.checks.check_retroformer`).
     """
     agent = load_yaml(config.agent) if isinstance(config.agent, str) else config.agent
     if isinstance(agent, Mapping):  # lessons live from trial to trial, and a reflector refuses any other scope
@@ -115,13 +112,11 @@ def play_trials(
 ) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
     """The first trial of each group of jobs, and for every job the trial that follows it.
 
-    Args:
-        play: jobs -> episodes, in order.
-        jobs: groups one after the other; a group begins with rollout 0.
+    Where the first trial left no lesson to be written, it takes the episode's place (under the job's rollout number).
 
-    Returns:
-        first trials, one per group, and episodes, one per job; where the first trial left no lesson to be written, it
-        takes the episode's place (under the job's rollout number).
+    Args:
+    play: jobs -> episodes, in order.
+    jobs: groups one after the other; a group begins with rollout 0.
     """
     heads = [replace(j, run_seed=derive_seed(j.run_seed, "first trial")) for j in jobs if j.rollout == 0]
     firsts = play(heads)

@@ -45,13 +45,7 @@ def round_metrics(
     group: int,
     gather: Gather = list,
 ) -> dict[str, float]:
-    """Rewards as TRL computes them; lengths in trained tokens per episode, also of those that were not cut off.
-
-    Args:
-        episodes: this rank's.
-        weights: by reward.
-        group: rollouts per task.
-    """
+    """Rewards as TRL computes them (`weights` by reward, `group` rollouts per task), and lengths in trained tokens."""
     everyone: list[Played] = gather([Played.of(e, train) for e in episodes])
     values = torch.tensor([[math.nan if p.terms is None else p.terms[name] for name in weights] for p in everyone])
     totals = (values * torch.tensor(list(weights.values()))).sum(dim=1)

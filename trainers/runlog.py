@@ -83,11 +83,7 @@ class RunLog:
         return (self.folder / SEAL).is_file()
 
     def append(self, name: str, record: Mapping[str, Any]) -> None:
-        """Append one JSON line to `name`.
-
-        Raises:
-            SpecError: the run has ended.
-        """
+        """Append one JSON line to `name`; `SpecError` if the run has ended."""
         if self.sealed:
             raise SpecError(f"{self.folder} is sealed ({SEAL}): its run has ended, and nothing is added to its records")
         append_lines(self.folder / name, record)
@@ -114,11 +110,7 @@ class RunLog:
         return digest(blob)
 
     def read(self, name: str) -> list[dict[str, Any]]:
-        """All whole records of a JSONL file of this run (none if it does not exist); the file stays as it is.
-
-        Raises:
-            ValueError: naming file and line of what is not JSON.
-        """
+        """All whole records of a JSONL file of this run (none if it does not exist); the file stays as it is."""
         return read_lines(self.folder / name)
 
     def rewind(self, name: str, key: str, last: int) -> None:

@@ -72,14 +72,10 @@ class Validation(Base):
     def evaluate(
         self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
     ) -> dict[str, float]:
-        """Play the validation tasks with the policy as it is.
+        """Play the validation tasks (rows of `trainers.rollouts.task_rows`) with the policy as it is.
 
         The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
         had been evaluated.
-
-        Args:
-            eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
-            ignore_keys: not used.
         """
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
         tasks = [task_of(row) for row in rows]

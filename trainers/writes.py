@@ -202,11 +202,7 @@ WRITE_CREDITS: dict[str, WriteCredit] = {
 
 
 def write_credit(name: str) -> WriteCredit:
-    """The row of `name`.
-
-    Raises:
-        SpecError: no such estimator.
-    """
+    """The row of `name`; `SpecError` with the nearest names if there is none."""
     if name not in WRITE_CREDITS:
         raise SpecError(f"unknown write_credit {name!r}{suggest(name, WRITE_CREDITS)}")
     return WRITE_CREDITS[name]
