@@ -34,7 +34,7 @@ from agentspec.parameters import check_types
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
-from agentspec.tasks import SPLITS, parse_seeds
+from agentspec.tasks import SPLITS, episode_key, parse_seeds
 from agentspec.types import Task
 from eval.cells import Settings
 from eval.limits import Limits
@@ -162,7 +162,14 @@ def _tasks(label: str, item: Any) -> list[Task]:
     split = data.get("split", "test")
     if split not in SPLITS:
         raise SpecError(f"tasks {label!r}: unknown split {split!r}; expected one of {', '.join(SPLITS)}")
-    return [Task(data["env"], seed, options, split) for seed in parse_seeds(texts)]
+    tasks = [Task(data["env"], seed, options, split) for seed in parse_seeds(texts)]
+    episodes = len({episode_key(task) for task in tasks})
+    if episodes < len(tasks):
+        raise SpecError(
+            f"tasks {label!r}: {len(tasks)} seeds start {episodes} different episodes (this suite has no more), and "
+            f"one episode played twice is not two tasks: give {episodes} seeds in a row; `rollouts` plays them again"
+        )
+    return tasks
 
 
 def _prices(item: Any, beside: Path) -> Prices:

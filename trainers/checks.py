@@ -17,6 +17,7 @@ from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
 from agentspec.tags import matches
+from agentspec.tasks import episode_key, make_tasks
 from trainers.estimators import ESTIMATORS
 from trainers.losses import LOSSES, loss
 from trainers.unread import REFLECTION, unread_with_a_value
@@ -251,3 +252,14 @@ def notes(config: ScaffoldConfig) -> Iterator[str]:
         )
     if config.top_entropy_quantile < 1:
         yield "top_entropy_quantile: the quantile is of each micro-batch, so it depends on how rows are split"
+    yield from _seen(config)
+
+
+def _seen(config: ScaffoldConfig) -> Iterator[str]:
+    """Held-out tasks that are training tasks all the same, in suites of few episodes."""
+    trained = {episode_key(task) for task in make_tasks(*config.world, config.train_tasks)}
+    validated = config.validation_tasks if config.validates else 0
+    for split, count in (("validation", validated), ("test", config.eval_tasks)):
+        tasks = make_tasks(*config.world, count, split=split)
+        if seen := sum(episode_key(task) in trained for task in tasks):
+            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: there are no others"

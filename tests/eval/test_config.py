@@ -77,6 +77,14 @@ def test_what_a_file_cannot_mean_is_refused(tmp_path: Path, changes: dict[str, A
         read_matrix(write(tmp_path, **changes))
 
 
+def test_one_episode_is_one_task(tmp_path: Path) -> None:
+    """A suite of ten has ten tasks, whatever their seeds are called."""
+    grid = {"env": "minigrid", "options": {"suite": "paper"}}
+    assert len(read_matrix(write(tmp_path, tasks={"grid": grid | {"seeds": "5-14"}})).tasks["grid"]) == 10
+    with pytest.raises(SpecError, match="11 seeds start 10 different episodes"):
+        read_matrix(write(tmp_path, tasks={"grid": grid | {"seeds": "0-10"}}))
+
+
 def test_a_label_that_stands_twice_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path)
     path.write_text(path.read_text().replace("scaffolds:\n", "scaffolds:\n  plain: {memory: base}\n"))

@@ -114,6 +114,10 @@ def test_from_the_command_line(folder: Path, tmp_path: Path, capsys: pytest.Capt
         main(["report", str(tmp_path / "nowhere"), "--to", str(tmp_path / "x")])
     assert end.value.code == 2
     assert "give the folder of an evaluation" in capsys.readouterr().err
+    (tmp_path / "episodes.jsonl").touch()  # killed before it could write its rows
+    with pytest.raises(SystemExit):
+        main(["report", str(tmp_path), "--to", str(tmp_path / "x")])
+    assert "has not ended; run its command again" in capsys.readouterr().err
 
 
 def hand_made(folder: Path, rows: list[dict[str, Any]]) -> Any:

@@ -291,3 +291,11 @@ def test_a_weight_that_is_no_number_is_refused(tmp_path: Path) -> None:
 def test_a_cap_below_1_is_told(tmp_path: Path) -> None:
     told = [n for n in notes(config(tmp_path, loss_type="cispo")) if "epsilon_high 0.2" in n]
     assert len(told) == 1 and not list(notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0)))
+
+
+def test_held_out_tasks_that_are_trained_on_are_told(tmp_path: Path) -> None:
+    """Of ten layouts, training tasks 0 to 7 are eight; seeds 20000 to 20009 are all ten."""
+    sizes = {"train_tasks": 8, "eval_tasks": 10, "environment": {"name": "minigrid", "options": {"suite": "paper"}}}
+    assert [n for n in notes(config(tmp_path, **sizes)) if "8 of 10 tasks of the test split" in n]
+    other = {"name": "minigrid", "options": {"suite": "practice"}}
+    assert not [n for n in notes(config(tmp_path, **{**sizes, "environment": other})) if "split" in n]

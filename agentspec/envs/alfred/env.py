@@ -85,6 +85,15 @@ class AlfredEnv(Game):
         "random": "agentspec.envs.alfred.expert:luck",
     }
 
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int | None:
+        """How many there are under these options: the paper's seven, one `task` or file; of ours one for each seed."""
+        if options.get("trial_file"):
+            return 1
+        if options.get("suite", "own") == "own":
+            return None if options.get("task", -1) < 0 else 1
+        return len(PAPER) if options.get("task", -1) < 0 else 1
+
     def __init__(
         self,
         *,

@@ -25,7 +25,7 @@ from gymnasium import spaces
 
 from agentspec.actions import parse_action
 from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum
-from agentspec.envs.minigrid.suites import Layout, layout_of
+from agentspec.envs.minigrid.suites import PAPER, Layout, layout_of
 from agentspec.envs.minigrid.texts import TEXTS, compact
 from agentspec.envs.minigrid.view import Thing, View, look
 from agentspec.metrics import Metric
@@ -111,6 +111,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         "rule_based": "agentspec.envs.minigrid.expert:expert",
         "random": "agentspec.envs.minigrid.expert:luck",
     }
+
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int | None:
+        """How many there are under these options: ten in the suite `paper`, one for a `task`, else one a seed."""
+        if options.get("task"):
+            return 1
+        return None if options.get("level") or options.get("suite", "paper") != "paper" else len(PAPER)
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
+from agentspec.envs.robothor.episodes import OWN, VALIDATION, Episode, own_episodes, read_episodes, scene_of
 from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor import homes, mining
 from agentspec.envs.thor.game import Game, Told, check, check_folders
@@ -82,6 +82,13 @@ class RoboThorEnv(Game):
         "rule_based": "agentspec.envs.robothor.expert:expert",
         "random": "agentspec.envs.robothor.expert:luck",
     }
+
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int:
+        """How many there are under these options: those of the suite, or one `episode`."""
+        if options.get("episode"):
+            return 1
+        return len(OWN if options.get("suite", "own") == "own" else VALIDATION)
 
     def __init__(
         self,

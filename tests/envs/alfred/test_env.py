@@ -181,3 +181,20 @@ def test_what_is_in_a_drawer_is_not_on_the_counter_above():
         assert info["metrics"]["goal_conditions_met"] == 0
     wanted = [o for o in env.event.metadata["objects"] if o["objectType"] == "CD"]
     assert ["Drawer"] in [[p.split("|")[0] for p in o["parentReceptacles"] or ()] for o in wanted]
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, None),
+        ({"task": 1}, 1),
+        ({"suite": "paper"}, 7),
+        ({"suite": "paper", "task": 2}, 1),
+        ({"trial_file": ""}, None),
+    ],
+)
+def test_how_many_episodes_there_are(options, count):
+    assert AlfredEnv.episodes(options) == count
+    if "suite" not in options and "trial_file" not in options:
+        env = AlfredEnv(**options)
+        assert len({env.trial_of(seed).id for seed in range(30)}) == (count or 30)
