@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
 
 from agentspec.episode import Job, Runner
 from agentspec.llm.none import NoLLM
@@ -29,8 +29,6 @@ from trainers.writes import EVERY, Plan
 FOLDER = "counterfactuals"
 """Folder of a run that holds them, one file per generation round."""
 
-STEP, KEPT, NUMBER = (f"counterfactual/{name}" for name in ("step", "kept", "number"))
-
 
 def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) -> list[LLMCall]:
     """The recorded calls that a re-roll repeats: all before the write, and the write where it is kept."""
@@ -45,14 +43,11 @@ def play_beside(
 ) -> list[ScoredEpisode]:
     """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants."""
     wanted = [
-        (i, plan, _job(job, episode.trajectory, retries))
-        for i, (job, episode) in enumerate(zip(jobs, episodes, strict=True))
-        for plan in rule.writes.plan(episode.trajectory, rule.train)
+        (e.trajectory, plan, _job(job, e.trajectory, retries))
+        for job, e in zip(jobs, episodes, strict=True)
+        for plan in rule.writes.plan(e.trajectory, rule.train)
     ]
-    if not wanted:
-        return list(episodes)
-    played = asyncio.run(_play_all(runner, [(episodes[i].trajectory, p, j) for i, p, j in wanted], rule))
-    return attach(episodes, played, rule)
+    return attach(episodes, asyncio.run(_play_all(runner, wanted, rule)), rule) if wanted else list(episodes)
 
 
 def _job(job: Job, trajectory: Trajectory, retries: int) -> Job:
@@ -70,7 +65,7 @@ async def _play_all(
     async def play(recorded: Trajectory, plan: Plan, job: Job) -> Trajectory:
         async with gate:
             [trajectory] = await _runner(runner, recorded, plan, rule).run_async([job])
-        return settled(mark(trajectory, plan), recorded, plan, rule)
+        return settled(trajectory, recorded, plan, rule)
 
     return list(await asyncio.gather(*(play(*one) for one in wanted)))
 
@@ -92,14 +87,14 @@ def _runner(runner: Runner, recorded: Trajectory, plan: Plan, rule: CreditRule) 
     return replace(quiet, llm=replayed)
 
 
-def mark(trajectory: Trajectory, plan: Plan) -> Trajectory:
-    """The record, with its plan."""
-    marks = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
-    return replace(trajectory, metrics={**trajectory.metrics, **marks})
+def marks(plan: Plan) -> dict[str, int]:
+    """What the metrics of a record say of its plan."""
+    return {f"counterfactual/{name}": value for name, value in asdict(plan).items()}
 
 
 def settled(trajectory: Trajectory, episode: Trajectory, plan: Plan, rule: CreditRule) -> Trajectory:
-    """The record; failed if it is not what was planned (a module that does not repeat), or earned what is no number."""
+    """The record with its plan; failed if it is another thing (a module that does not repeat), or earned no number."""
+    trajectory = replace(trajectory, metrics={**trajectory.metrics, **marks(plan)})
     problems = list(differences(episode, trajectory, plan, rule))
     try:
         rule.score([trajectory])
@@ -146,12 +141,11 @@ def attach(
 def differences(episode: Trajectory, other: Trajectory, plan: Plan, rule: CreditRule) -> Iterator[str]:
     """What makes a record another thing than the counterfactual of `plan` of this episode (nothing: it is that)."""
     where = f"counterfactual of step {plan.step} of {episode.episode}"
-    marks: Mapping[str, object] = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
     if (other.task, other.rollout, other.seed) != (episode.task, episode.rollout, episode.seed):
         yield f"{where}: it is of {other.episode}"
     if other.policy != episode.policy:
         yield f"{where}: it was played by policy {other.policy}"
-    if any(other.metrics.get(name) != value for name, value in marks.items()):
+    if any(other.metrics.get(name) != value for name, value in marks(plan).items()):
         yield f"{where}: its plan is not {plan}"
     if plan.step == EVERY and any(c.tag.module.startswith("memory.") for c in other.calls):
         yield f"{where}: it has calls of memory"
