@@ -20,7 +20,7 @@ from typing import Any
 
 from agentspec.records.chain import check_end, files_of, linked_receipts, manifest_of, read_manifests, read_round
 from agentspec.records.completions import check_completions
-from agentspec.records.folder import MANIFEST, TRAJECTORIES, UPDATES
+from agentspec.records.folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
@@ -30,7 +30,6 @@ from trainers.estimators import estimator
 from trainers.losses import UpdateSize, loss
 from trainers.provenance import check_tokens
 from trainers.receipts import receipt_record, receipt_rows, settings
-from trainers.run_folder import holds_run
 from trainers.sequences import Row
 
 TOLERANCE, SMALLEST = 1e-9, 1e-12

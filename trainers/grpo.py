@@ -24,6 +24,7 @@ from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
 from agentspec.records.folder import EVALUATIONS, METRICS, last_complete_checkpoint
+from agentspec.records.log import RunLog
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
@@ -44,7 +45,6 @@ from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, local_llm, rollout_jobs
 from trainers.round_metrics import SamplingMetrics, episode_metrics, named, round_metrics
-from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree.model import enable_tree
 from trainers.validation import Validation

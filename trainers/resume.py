@@ -22,11 +22,10 @@ from transformers import TrainerState
 from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotate_checkpoints
 
 from agentspec.files import write_atomic
-from agentspec.records.folder import STATE, TRAINER_STATE
+from agentspec.records.folder import STATE, TRAINER_STATE, hold, set_aside
 from agentspec.registry import SpecError
 from trainers.micro_batches import ROWS
 from trainers.mixin import Base
-from trainers.run_folder import hold, set_aside
 from trainers.sequences import Row, TokenSequence
 
 FORMAT = 2

@@ -21,6 +21,7 @@ from agentspec.cli import main
 from agentspec.files import digest, file_digest
 from agentspec.records.completions import check_completion
 from agentspec.records.digests import differing, field_digests
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from benchmarks.edits import FILE_KINDS, KINDS, apply, edit
 from benchmarks.tamper import RUN, train
@@ -33,7 +34,6 @@ from trainers.estimators import ESTIMATORS
 from trainers.provenance import check_tokens
 from trainers.receipts import row_digest
 from trainers.rollouts import task_rows
-from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
 SUPO = {

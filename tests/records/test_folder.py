@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 
-from agentspec.records.folder import checkpoints, last_complete_checkpoint
+from agentspec.records.folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
 from agentspec.registry import SpecError
-from trainers.run_folder import LOCK, hold, holds_run, set_aside
 
 HOLDER = """
 import sys
-from trainers.run_folder import hold
+from agentspec.records.folder import hold
 with hold(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -135,7 +134,7 @@ def test_a_folder_without_a_run_is_left_alone(tmp_path: Path) -> None:
 def test_own_output_stays(tmp_path: Path) -> None:
     """The log that a shell redirects a new run's output into does not move away with the earlier run."""
     _run_in(tmp_path)
-    script = "import sys; from trainers.run_folder import set_aside; set_aside(sys.argv[1]); print('after')"
+    script = "import sys; from agentspec.records.folder import set_aside; set_aside(sys.argv[1]); print('after')"
     with open(tmp_path / "run.log", "w") as log:
         subprocess.run([sys.executable, "-c", script, str(tmp_path)], stdout=log, check=True)
     assert (tmp_path / "run.log").read_text() == "after\n"
