@@ -34,7 +34,7 @@ from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import play_beside
 from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, ScoredEpisode
-from trainers.distributed import KnownLayout, check_trained, is_sharded
+from trainers.distributed import check_layout, check_trained, is_sharded, keep_precision
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.forward import frozen_output
 from trainers.frozen import FrozenOutput, frozen_layers, layer_above
@@ -51,7 +51,7 @@ from trainers.validation import Validation
 from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
+class ScaffoldGRPOTrainer(ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -99,6 +99,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
         self._sampling_metrics = SamplingMetrics()
+
+    def create_accelerator_and_postprocess(self) -> None:
+        """As transformers'; nothing is built on a parallel layout that would hang or round."""
+        super().create_accelerator_and_postprocess()
+        check_layout(self.accelerator, self.args)
+        keep_precision(self.accelerator)
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.
