@@ -109,7 +109,7 @@ def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
     )
 
 
-def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
+def _targets(model: Any, config: ScaffoldConfig) -> list[str]:
     """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection."""
     names = [name for name, _ in model.named_modules()]
     if config.lora_targets != ["all-linear"]:
@@ -118,7 +118,5 @@ def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
             if not any(f".{name}".endswith(f".{target}") for name in names) or not target:
                 raise SpecError(f"lora_targets: {config.model} has no module {target!r}{suggest(target, there)}")
         return config.lora_targets
-    wrapper: Any = model
-    head = wrapper.get_output_embeddings()
-    named = model.named_modules()
+    head, named = model.get_output_embeddings(), model.named_modules()
     return sorted({n.rpartition(".")[2] for n, m in named if isinstance(m, nn.Linear) and m is not head})
