@@ -176,7 +176,7 @@ def _read(sequences: Sequence[TokenSequence], places: Places) -> list[list[int]]
 def _packed(
     packing: Packing, tokens: Sequence[list[int]], device: torch.device
 ) -> tuple[dict[str, Any], Sequence[Sequence[int]]]:
-    """Inputs (B, L) of one forward, a prefix tree or rows padded right; where in it, flattened, each list's tokens are."""
+    """Inputs (B, L) of one forward, a prefix tree or rows padded right; where, flattened, each list's tokens are."""
     if packing == "tree":
         tree = build_tree(tokens)
         return packed_inputs(tree, device), tree.places
