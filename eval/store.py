@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import append_lines, digest, held, jsonable, parse_line, repair_lines, whole_lines, write_atomic
+from agentspec.llm.pricing import Prices
+from eval.repricing import repriced
 
 EPISODES = "episodes.jsonl"
 LOCK = ".lock"
@@ -30,13 +32,14 @@ class Store:
 
     Args:
         folder: where they are kept; made when the first one is added.
+        prices: what episodes cost when they are read; `None`: what they cost when they were played.
 
     Raises:
         ValueError: a line that is no record of an episode, with its number.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | Path, prices: Prices | None = None) -> None:
+        self.folder, self.prices = Path(folder), prices
         self.path = self.folder / EPISODES
         self._records: dict[str, Record] = {}
         self._configurations: dict[str, str] = {}
@@ -68,8 +71,9 @@ class Store:
             yield self
 
     def get(self, key: str) -> Record | None:
-        """The episode that counts under `key`."""
-        return self._records.get(key)
+        """The episode that counts under `key`, at the store's prices."""
+        record = self._records.get(key)
+        return record if record is None or self.prices is None else repriced(record, self.prices)
 
     def __len__(self) -> int:
         return len(self._records)

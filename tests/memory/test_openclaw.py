@@ -301,3 +301,17 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     for preset in ("paper", "rl"):
         assert succeeds({"name": "openclaw", "preset": preset}, scope=scope, layout=layout)
+
+
+def test_a_rewrite_has_room_for_all_rules_there_may_be() -> None:
+    """A memory as full as it may be: its rewrite, in JSON, fits into the answer."""
+    rules = {f"rule number {i}": "When the energy is below 20 %, rest before the next order." for i in range(40)}
+    asked = Asked(dream="{}")
+    memory = claw(asked, preset="rl", least_score=0.1, least_recalls=1, least_queries=1, recent=0)
+    memory._write_rules(rules)
+    memory._append("The bus leaves at 12:40.", 0)
+    memory.log.recalled(0, 0.9, "bus", 0)
+    asyncio.run(memory._dream())
+    whole = json.dumps({"rules": [{"name": name, "text": text} for name, text in memory.rules.items()]})
+    assert len(memory.rules) > 10
+    assert asked.requests[-1].sampling.max_tokens >= estimate_tokens(whole) > memory.answer_tokens

@@ -37,7 +37,8 @@ RULES = """You act in a room of a house, one action at a time. Only objects with
 used; you see them listed. Moves are 0.25 m, turns 90 degrees, the camera looks up or down by 15 degrees.
 - You can hold one object. Closed containers hide what is in them; open them first.
 - Heat: put it into the microwave, close it, turn it on. Cool: put it into the fridge and close it. Clean: put it into \
-the sink basin and turn the faucet on. Slice: hold a knife.
+the sink basin and turn the faucet on. Slice: hold a knife. Look at it in the light: hold it and turn the lamp on, \
+with the lamp in view.
 - You have {steps} steps; fewer steps are better. {stop}
 Your task: {task}"""
 

@@ -78,6 +78,11 @@ view. Distances are in cells from you: "2 forward, 1 left" is two cells ahead an
 - "get to the goal": walk onto it; done is not needed.
 - You have {steps} steps; fewer steps are better."""
 
+MATCHING = """
+- "the matching object": two objects stand at the end of the hallway; go next to the one that equals the object in the \
+small room at the hallway's other end. Going next to the other one fails."""
+"""A rule of the levels whose mission names an object that is to be seen first."""
+
 
 class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
     """One grid, one mission.
@@ -146,7 +151,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         self.render_mode = render_mode
         self.action_schema = _schema(menu=action_mode == "menu", count=actions_of(level) if level else len(ACTIONS))
         answer = "The actions are: " + ", ".join(self.action_schema.choices) if self.action_schema.choices else ""
-        self.instruction = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
+        self._rules = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
         shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=10_000, charset=ASCII)}
         if images:
@@ -263,6 +268,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         for number in todo:
             self._act(number)
         self._last = last
+
+    @property
+    def instruction(self) -> str:
+        """Rules of the game, and of the level where it has one of its own."""
+        first, _, steps = self._rules.partition("\n- You have")
+        matching = MATCHING if self.layout is not None and "Memory" in self.layout.id else ""
+        return f"{first}{matching}\n- You have{steps}"
 
     # -- internals ---------------------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ project's site. Cost per step: none to retrieve; 2 calls per `every` steps, and 
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -37,6 +38,7 @@ from agentspec.memory.parts.steps import (
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import when
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -136,6 +138,7 @@ class MemoryBank:
         self._merged: list[int] = []  # summaries and insights that are not in the overview yet
         self._plan = ""
         self._days, self._last_pass = 0, 0
+        self._seed = services.rng.getrandbits(32)  # of the draws: a restored memory forgets as it would have
         self._day_began, self._held_from = 0, 0  # steps of this episode
         self._task = ""
         self._forgotten = 0
@@ -162,7 +165,7 @@ class MemoryBank:
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
+            items += [RecallItem(brief(self._named(e), count), 1.0, "step", priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -203,11 +206,15 @@ class MemoryBank:
         steps = newest_within([self._named(e) for e in day], self.steps_tokens, count)
         head = HEAD.format(task=self._task, steps="\n".join(steps + ([ending] if ending else [])))
         known = [e.text for e in self.entries.values() if e.kind == "insight"]
-        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count)
+        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count, "ones")
         prompts = (
             head + SUMMARISE.format(words=self.answer_tokens // 3),
             head
-            + CONCLUDE.format(known="\n".join(known) or "(none)", next="in the next episode" if ending else "next"),
+            + CONCLUDE.format(
+                known="\n".join(known) or "(none)",
+                words=self.answer_tokens // 2,
+                next="in the next episode" if ending else "next",
+            ),
         )
         summary, found = await asyncio.gather(
             self.services.ask("summary", prompts[0], self.answer_tokens),
@@ -223,7 +230,7 @@ class MemoryBank:
         prompt = OVERVIEW.format(
             words=self.answer_tokens // 2,
             overview=self.overview or "(none)",
-            notes="\n".join(newest_within(notes, self.steps_tokens, count)),
+            notes="\n".join(newest_within(notes, self.steps_tokens, count, "notes")),
         )
         answer = await self.services.ask("overview", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, count)
@@ -255,11 +262,11 @@ class MemoryBank:
 
     def _fade(self) -> None:
         """Ebbinghaus: draw, or compare with the threshold; what belongs to the running day is not touched."""
-        now = self.services.time()
+        now, draw = self.services.time(), random.Random(f"{self._seed}/{self._days}")
         for key, entry in list(self.entries.items()):
             if self.forget == "sample":
                 elapsed = now.total - max(entry.since, self._last_pass)
-                stays = self.services.rng.random() < retention(elapsed, entry.strength, self.time_unit)
+                stays = draw.random() < retention(elapsed, entry.strength, self.time_unit)
             else:
                 stays = self.forget == "never" or self._retained(key) >= self.least
             if not stays:
@@ -310,7 +317,8 @@ class MemoryBank:
 
     def _item(self, key: int, score: float) -> RecallItem:
         entry = self.entries[key]
-        label = {"raw": "", "summary": "[Trajectory Summary] ", "insight": "[Environment Insight] "}[entry.kind]
+        over = when(entry.episode, self.services.time().episode)
+        label = {"summary": f"[Trajectory Summary] {over}", "insight": "[Environment Insight] "}.get(entry.kind, "")
         text = self._named(entry) if entry.kind == "raw" else f"{label}{entry.text}"
         kind = "episodic" if entry.kind == "raw" else entry.kind
         return RecallItem(
@@ -335,12 +343,12 @@ class MemoryBank:
         return {**counts, "forgotten": self._forgotten, "mean_strength": strength}
 
     def snapshot(self) -> bytes:
-        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
+        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed]
         return dump_state([keyed(self.entries), self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
         entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)
-        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten = times
+        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed = times
         self.entries = {key: Entry(*values) for key, values in entries}
         for kind, index in self._index.items():
             index.load([(key, entry.text) for key, entry in self.entries.items() if entry.kind == kind])

@@ -16,7 +16,7 @@ CONCLUDE = (
     "\n\nInsights so far:\n{known}\n\nWhat do the steps show about this environment that will hold again? Give costs, "
     "durations and thresholds as numbers; repeat nothing that is known; invent nothing. Answer with JSON:\n"
     '{{"insights": [at most 3 sentences], "avoid": [at most 2 things not to do, and why], '
-    '"next": [the 3 things to do {next}, in order]}}'
+    '"next": [the 3 things to do {next}, in order]}}, at most {words} words in all'
 )
 OVERVIEW = (
     "You keep the memory of an agent that acts in an environment. Merge its overview with the newer notes into one "

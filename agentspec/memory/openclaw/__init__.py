@@ -85,7 +85,7 @@ class OpenClaw:
         promoted: most log entries that are promoted at once.
         max_loss: share of `MEMORY.md`'s rules that a rewrite may lose; one that loses more is refused.
         state_tokens: most tokens of the state kept with a step.
-        answer_tokens: most tokens of each answer.
+        answer_tokens: most tokens of each answer (a rewrite of `MEMORY.md` has twice `memory_tokens`).
         steps_tokens: most tokens of steps in a prompt.
     """
 
@@ -186,7 +186,7 @@ class OpenClaw:
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(c), count), 1.0, priority=5.0 + c.step) for c in newest]
+            items += [RecallItem(brief(self._named(c), count), 1.0, "step", priority=5.0 + c.step) for c in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -218,7 +218,7 @@ class OpenClaw:
             steps="\n".join(newest_within(steps, self.steps_tokens, count) + ([ending] if ending else [])),
         )
         self._since = step
-        prompt = head + LEARN.format(most=EDITS)
+        prompt = head + LEARN.format(most=EDITS, words=self.answer_tokens // 2)
         answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits))
         for edit in answer.value.edits[:EDITS] if answer.value else ():
             self._counts["edits"] += self.workspace.apply(edit)
@@ -268,8 +268,10 @@ class OpenClaw:
         if not best:
             return
         entries = "\n".join(f"- {self.log[key].text}" for _, key in sorted(best, key=lambda hit: hit[1]))
-        prompt = DREAM.format(rules=self.workspace.rules_shown(), entries=entries)
-        answer = await self.services.ask("dream", prompt, self.answer_tokens, json_of({"rules": list[Rule]}))
+        most = self.workspace.rule_tokens
+        prompt = DREAM.format(rules=self.workspace.rules_shown(), entries=entries, words=most * 2 // 3)
+        room = max(self.answer_tokens, 2 * most)  # all rules, and the JSON around them
+        answer = await self.services.ask("dream", prompt, room, json_of({"rules": list[Rule]}))
         if answer.value is None:
             return
         rules = {

@@ -8,7 +8,7 @@ import gymnasium
 import pytest
 
 from agentspec.envs import check_environment
-from agentspec.envs.alfred.env import AlfredEnv
+from agentspec.envs.alfred.env import RULES, AlfredEnv
 from agentspec.envs.alfred.expert import Expert, luck
 from agentspec.envs.alfred.own import TASKS
 from agentspec.envs.alfred.trials import TYPES
@@ -198,3 +198,8 @@ def test_how_many_episodes_there_are(options, count):
     if "suite" not in options and "trial_file" not in options:
         env = AlfredEnv(**options)
         assert len({env.trial_of(seed).id for seed in range(30)}) == (count or 30)
+
+
+def test_the_rules_say_how_each_kind_of_task_is_done() -> None:
+    for means in ("microwave", "fridge", "faucet", "knife", "lamp"):
+        assert means in RULES
