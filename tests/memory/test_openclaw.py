@@ -308,10 +308,10 @@ def test_a_rewrite_has_room_for_all_rules_there_may_be() -> None:
     rules = {f"rule number {i}": "When the energy is below 20 %, rest before the next order." for i in range(40)}
     asked = Asked(dream="{}")
     memory = claw(asked, preset="rl", least_score=0.1, least_recalls=1, least_queries=1, recent=0)
-    memory._write_rules(rules)
+    memory.workspace.write(rules)
     memory._append("The bus leaves at 12:40.", 0)
     memory.log.recalled(0, 0.9, "bus", 0)
     asyncio.run(memory._dream())
-    whole = json.dumps({"rules": [{"name": name, "text": text} for name, text in memory.rules.items()]})
-    assert len(memory.rules) > 10
+    whole = json.dumps({"rules": [{"name": name, "text": text} for name, text in memory.workspace.rules.items()]})
+    assert len(memory.workspace.rules) > 10
     assert asked.requests[-1].sampling.max_tokens >= estimate_tokens(whole) > memory.answer_tokens
