@@ -18,9 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agentspec.files import append_lines, digest, jsonable, parse_line, repair_lines, whole_lines, write_atomic
+from agentspec.files import append_lines, digest, held, jsonable, parse_line, repair_lines, whole_lines, write_atomic
 from agentspec.llm.pricing import Prices
-from agentspec.registry import SpecError
 from eval.repricing import repriced
 
 EPISODES = "episodes.jsonl"
@@ -65,18 +64,11 @@ class Store:
         Raises:
             SpecError: somebody else is writing.
         """
-        from filelock import FileLock, Timeout
-
-        self.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with FileLock(self.folder / LOCK, timeout=0):
-                repair_lines(self.path)
-                self.read()
-                yield self
-        except Timeout:
-            raise SpecError(
-                f"another evaluation is writing into {self.folder}; wait until it has ended, or choose another folder"
-            ) from None
+        refusal = f"another evaluation is writing into {self.folder}"
+        with held(self.folder / LOCK, refusal, "wait until it has ended, or choose another folder"):
+            repair_lines(self.path)
+            self.read()
+            yield self
 
     def get(self, key: str) -> Record | None:
         """The episode that counts under `key`, at the store's prices."""

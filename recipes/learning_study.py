@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Train what is not trained, evaluate what is not evaluated, audit, report."""
+    from agentspec.extends import read_extended
     from agentspec.registry import SpecError
     from eval.study import read_study
     from eval.study.training import train_all
-    from trainers.arguments import read_layers
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
     parser.add_argument("--config", metavar="FILE", help="the study, or the name of one that ships")
@@ -40,7 +40,7 @@ def main() -> None:
     if not options.config:
         shipped = ", ".join(sorted(path.stem for path in CONFIGS.glob("transfer_*.yaml")))
         raise SpecError(f"a study is one YAML file: give --config FILE, or the name of one that ships ({shipped})")
-    data = read_layers(options.config, shelf=CONFIGS)
+    data = read_extended(options.config, CONFIGS)
     study = read_study({**data, "out": options.out} if options.out else data)
     configs = {name: arm_config(study, name) for name in study.arms}
     warm = written(study, "warmup", study.warmup, False) if study.warmup else None
@@ -76,8 +76,7 @@ def arm_config(study: Study, name: str) -> Any:
         SpecError: as `written`, or its trainer would change the scaffold.
     """
     from agentspec.registry import SpecError
-    from trainers.memory import as_memory
-    from trainers.supo import as_supo
+    from trainers.presets import as_memory, as_supo
 
     arm = study.arms[name]
     agent = study.scaffolds[arm.scaffold]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
 from agentspec.actions import suggest
@@ -16,11 +16,11 @@ from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
+from agentspec.tags import matches
 from agentspec.tasks import episode_key, make_tasks
 from trainers.estimators import ESTIMATORS
-from trainers.fields import REFUSED
 from trainers.losses import LOSSES, loss
-from trainers.sequences import TrainFilter, unmatched_patterns
+from trainers.sequences import TrainFilter
 from trainers.unread import REFLECTION, unread_with_a_value
 from trainers.writes import write_credit
 
@@ -57,30 +57,13 @@ RANGES: dict[tuple[float, float], str] = {
 
 
 def check(config: ScaffoldConfig) -> None:
-    """Refuse what cannot work, would not be exact, or would change nothing.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what cannot work, would not be exact, or would change nothing."""
     _ = config.reward_set, config.world, config.other_specs, config.starting_memory, config.evaluation_specs
     AgentSpec.from_data({"sampling": config.evaluation_sampling})
     check_reporters(config)
     for found in (_values, unread_with_a_value, _calls, _writes, _rounds, _vllm):
         for problem in found(config):
             raise SpecError(problem)
-
-
-def check_given(names: Iterable[str], where: str) -> None:
-    """Refuse fields that a user names and nobody reads, whatever their value.
-
-    Args:
-        names: keys of a YAML file, or options of a command line.
-        where: what they were read from, for the message.
-    """
-    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
-    for name in names:
-        if name in why:
-            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:
@@ -113,7 +96,7 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
         if not getattr(config, name):
             yield f"{name} is empty, so nothing would be trained; name some, or leave the field out"
     for name, patterns in (("train_calls", config.train_calls), ("mask_truncated", config.mask_truncated)):
-        if missing := unmatched_patterns(paths, TrainFilter(tuple(patterns))):
+        if missing := [p for p in patterns if not any(matches(path, p) for path in paths)]:
             there = ", ".join(sorted(set(paths))) or "none (no module calls the model)"
             yield f"{name} {missing} match no call of this scaffold, so they would change nothing; its calls: {there}"
     for spec in specs:
@@ -170,8 +153,8 @@ def _writes(config: ScaffoldConfig) -> Iterator[str]:
             f"write_credit {spec.name!r} with roles {list(roles)}: an episode is played again from its recorded "
             "answers, and those of helper models are not given back; use `write_credit: ablation`, or no helper"
         )
-    paths, writes = own_memory_paths(config), TrainFilter(tuple(config.write_calls))
-    if not any(config.train_filter.matches(p) and writes.matches(p) for p in paths):
+    paths = own_memory_paths(config)
+    if not any(config.train_filter.matches(p) and matches(p, config.write_calls) for p in paths):
         yield (
             f"write_credit {spec.name!r}, but no call of memory {config.spec.memory.name!r} is both trained "
             f"(train_calls {config.train_calls}) and a write (write_calls {config.write_calls}); its calls are "
@@ -228,11 +211,7 @@ def _vllm(config: ScaffoldConfig) -> Iterator[str]:
 
 
 def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what does not train a reflector beside a frozen actor."""
     for problem in _retroformer(config):
         raise SpecError(problem)
 

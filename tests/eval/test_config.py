@@ -47,6 +47,15 @@ def test_a_file_says_what_is_played(tmp_path: Path) -> None:
     assert main(["eval", "--config", str(path), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
 
 
+def test_a_file_may_hold_only_what_differs_from_another(tmp_path: Path) -> None:
+    write(tmp_path)
+    path = tmp_path / "more.yaml"
+    path.write_text("extends: matrix.yaml\nrollouts: 3\npolicies: {scripted: null, rule_based: {}}\n")
+    matrix = read_matrix(path)
+    assert [p.name for p in matrix.policies] == ["random", "rule_based"] and matrix.settings.rollouts == 3
+    assert set(matrix.scaffolds) == {"plain", "sheet"}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agentspec.memory.memorybank import Entry, MemoryBank, avoid_by_rule, by_rule, retention
+from agentspec.memory.memorybank import MemoryBank
+from agentspec.memory.memorybank.entries import Entry, avoid_by_rule, by_rule, retention
 from agentspec.registry import SpecError
 from tests.memory.by_hand import TASK, Asked, episode, learn, recall, services, step
 from tests.memory.recall_world import succeeds

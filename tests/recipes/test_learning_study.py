@@ -14,13 +14,13 @@ pytest.importorskip("trl")
 pytest.importorskip("peft")
 pytest.importorskip("minigrid")
 
+from agentspec.extends import read_extended
 from agentspec.files import read_lines
 from agentspec.registry import SpecError
 from eval.study import training
 from recipes import grpo_delivery, grpo_memory, learning_study, sft_warmup, supo_delivery
 from recipes.common import CONFIGS
 from tests.tiny import tiny_model, tiny_tokenizer
-from trainers.arguments import read_layers
 
 RECIPES = {"grpo_delivery": grpo_delivery, "grpo_memory": grpo_memory, "supo_delivery": supo_delivery}
 SHEET = {"name": "dynamic_cheatsheet", "preset": "rl", "every": 2, "sheet_tokens": 8, "step_tokens": 8}
@@ -166,10 +166,10 @@ def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
     from eval.study import read_study
     from eval.study.cost import Rates
 
-    data = read_layers(name, shelf=CONFIGS)
+    data = read_extended(name, CONFIGS)
     on_cpu = {"use_cpu": True, "bf16": False, "report_to": "none", "use_vllm": False}
     if name == "transfer_qwen3_4b":
-        for key in [k for k in read_layers("qwen3_4b_paper", shelf=CONFIGS) if k.startswith("vllm")]:
+        for key in [k for k in read_extended("qwen3_4b_paper", CONFIGS) if k.startswith("vllm")]:
             on_cpu[key] = None
         data["train"] |= on_cpu
     given = read_study({**data, "out": str(tmp_path)})
@@ -188,7 +188,7 @@ def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
 def test_the_paper_s_six_are_evaluated() -> None:
     from eval.study import read_study
 
-    scaffolds = read_study(read_layers("transfer_cpu", shelf=CONFIGS)).scaffolds.values()
+    scaffolds = read_study(read_extended("transfer_cpu", CONFIGS)).scaffolds.values()
     agents = {(spec.reasoning.name, spec.memory.name) for spec in scaffolds}
     sheets = {("react", memory) for memory in ("dynamic_cheatsheet", "memorybank", "openclaw", "base")}
     assert sheets | {("direct", "base"), ("mad", "base")} <= agents

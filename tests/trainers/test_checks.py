@@ -25,9 +25,9 @@ from trl import GRPOConfig
 from agentspec.cli.errors import is_expected
 from agentspec.declaration import Declaration
 from agentspec.registry import REGISTRY, Entry, SpecError
-from trainers.ahead import OURS
+from trainers.ahead import OURS, check_names
 from trainers.arguments import parse_config
-from trainers.checks import check_given, check_reporters, notes
+from trainers.checks import check_reporters, notes
 from trainers.config import ScaffoldConfig
 from trainers.fields import FIXED, REFUSED, USED, field_rules
 
@@ -198,8 +198,8 @@ def test_what_is_set_with_effect_is_accepted(tmp_path: Path) -> None:
 def test_naming_an_unread_field_is_refused_even_at_its_default(tmp_path: Path) -> None:
     """`temperature: 1.0` beside an agent at 0.7 would mislead; the default of a fixed field is harmless."""
     with pytest.raises(SpecError, match=r"c\.yaml: `temperature` is not read"):
-        check_given(["learning_rate", "temperature"], "c.yaml")
-    check_given(["scale_rewards", "learning_rate", "model"], "c.yaml")
+        check_names(["learning_rate", "temperature"], "c.yaml")
+    check_names(["scale_rewards", "learning_rate", "model"], "c.yaml")
     path = tmp_path / "c.yaml"
     path.write_text("use_cpu: true\nbf16: false\n")
     with pytest.raises(SpecError, match="command line: `max_tool_calling_iterations` is not read"):

@@ -22,7 +22,8 @@ from agentspec.envs.alfred.listing import in_view, worded
 from agentspec.envs.alfred.own import TASKS, own_trial
 from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import PAPER, Trial, read_trial, trial_path
-from agentspec.envs.thor.game import Game, Told, check, check_folders, check_index
+from agentspec.envs.shared import check
+from agentspec.envs.thor.game import Game, Told, check_folders, check_index
 from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
 from agentspec.envs.thor.names import Names

@@ -12,7 +12,6 @@ found by breadth-first search when the first episode on a layout succeeds.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -28,6 +27,7 @@ from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum
 from agentspec.envs.minigrid.suites import PAPER, Layout, layout_of
 from agentspec.envs.minigrid.texts import TEXTS, compact
 from agentspec.envs.minigrid.view import Thing, View, look
+from agentspec.envs.shared import ASCII, check, printable
 from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema, ActionSpec
 
@@ -140,9 +140,9 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         if not (suite or level or task):
             suite = "paper"
         layout_of(suite=suite, level=level, task=task)
-        _check("observation", observation, tuple(TEXTS))
-        _check("action_mode", action_mode, ("native", "menu"))
-        _check("render_mode", render_mode, (None, "rgb_array"))
+        check("observation", observation, tuple(TEXTS))
+        check("action_mode", action_mode, ("native", "menu"))
+        check("render_mode", render_mode, (None, "rgb_array"))
         if max_steps < 1:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
         self._choice = {"suite": suite, "level": level, "task": task}
@@ -154,7 +154,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         answer = "The actions are: " + ", ".join(self.action_schema.choices) if self.action_schema.choices else ""
         self._rules = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
-        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=10_000, charset=_CHARSET)}
+        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=10_000, charset=ASCII)}
         if images:
             shown["image"] = spaces.Box(0, 255, (7 * TILE, 7 * TILE, 3), np.uint8)
         self.observation_space = spaces.Dict(shown)
@@ -214,7 +214,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         world, last = self.world, self._last
         # A model that writes no action needs few words more than that; the whole error stands in `info`.
         said = last.message or ("that was no action" if self._word is compact and last.error else last.error)
-        observation: dict[str, Any] = {"text": _printable(self._word(self._view, said))}
+        observation: dict[str, Any] = {"text": printable(self._word(self._view, said))}
         if self.images:
             observation["image"] = world.get_pov_render(tile_size=TILE)
         return observation, self._info(self._view)
@@ -398,20 +398,6 @@ def _toggled(ahead: Thing | None, now: Thing | None) -> str:
     if now is not None and now.name == ahead.name:
         return f"toggled {ahead.name}, nothing changed"
     return f"toggled {ahead.name}, now {now.name if now else 'nothing'} is in front"
-
-
-def _check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
-
-
-_CHARSET = "".join(chr(c) for c in range(32, 127)) + "\n"
-_OTHER = re.compile(r"[^ -~\n]")
-
-
-def _printable(text: str) -> str:
-    # Messages quote what the agent wrote; the text space holds printable ASCII only.
-    return _OTHER.sub("?", text)
 
 
 assert len(CALLS) == len(ACTIONS)

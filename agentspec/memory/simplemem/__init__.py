@@ -28,7 +28,6 @@ Cost: one call per `window` of steps that pass, and one per cluster; retrieval 0
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -48,7 +47,8 @@ from agentspec.memory.parts.entries import (
     task_of,
     told,
 )
-from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, WORD, Check, Note, Plan, data_of
+from agentspec.memory.simplemem.names import Named, is_vague, names_in
+from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, Check, Note, Plan, data_of
 from agentspec.parameters import at_least, settings
 from agentspec.services import Services
 from agentspec.state import dump_state, joined, load_state
@@ -84,11 +84,6 @@ PRESETS = {
 SEMANTIC, LEXICAL, STRUCTURED = 25, 5, 5
 """Most notes that each way of looking up contributes."""
 MOST_QUERIES, MOST_CHECKS = 4, 2
-
-_NAME = re.compile(r"\b(?:[A-Z][\w-]*|\w*\d[\w.]*)\b")
-_VAGUE = re.compile(
-    r"\b(he|she|it|they|him|her|them|this|these|those|now|today|yesterday|tomorrow|later|soon|recently|ago)\b", re.I
-)
 
 
 class SimpleMemory:
@@ -191,7 +186,7 @@ class SimpleMemory:
         self.capacity, self.recent = capacity, recent
         self.entries = Entries(embedder_of(services), capacity, words=True)
         self.archive: list[Entry] = []
-        self._named: dict[str, dict[int, None]] = {}  # place or entity -> notes that name it
+        self._named = Named()
         self._window: list[Step] = []  # the overlap, then the steps that are not notes yet
         self._new = 0  # how many of these are new
         self._before: list[list[str]] = []  # what the gate compares with: states, and what was done in them
@@ -228,7 +223,7 @@ class SimpleMemory:
         cosine = {entry.id: score for entry, score in self.entries.near(query, SEMANTIC)}
         bm25 = {entry.id: score for entry, score in self.entries.by_words(query, LEXICAL)}
         top = max(bm25.values(), default=1.0)
-        named = self._naming(query)
+        named = [id for id in self._named.by(query) if id in self.entries]
         ids = dict.fromkeys([*cosine, *bm25, *named[:STRUCTURED]])
         scores = {
             id: cosine.get(id, 0.0) + self.words_weight * bm25.get(id, 0.0) / top + self.match_weight * (id in named)
@@ -241,14 +236,8 @@ class SimpleMemory:
 
     def depth_of(self, query: str) -> int:
         """How many notes a query of this complexity recalls."""
-        complexity = min(1.0, len(set(_NAME.findall(query))) / 20)
+        complexity = min(1.0, len(names_in(query)) / 20)
         return math.floor(self.top * (1 + self.depth * complexity))
-
-    def _naming(self, query: str) -> list[int]:
-        """Notes with a place or entity that the query names."""
-        words = [w.casefold() for w in WORD.findall(query)]
-        phrases = dict.fromkeys(" ".join(words[i : i + n]) for n in (3, 2, 1) for i in range(len(words) - n + 1))
-        return [id for id in dict.fromkeys(id for p in phrases for id in self._named.get(p, ())) if id in self.entries]
 
     async def _planned(self, state: str, k: int | None) -> list[tuple[Entry, float]]:
         """Queries written by the model, and what it finds still missing; the observation itself is always looked up."""
@@ -301,8 +290,8 @@ class SimpleMemory:
         """How new a text is beside others: 0 (one of them) to 1 (also where there are none)."""
         if not before:
             return 1.0
-        known = {name for other in before for name in _NAME.findall(other)}
-        names = set(_NAME.findall(text))
+        known = {name for other in before for name in names_in(other)}
+        names = names_in(text)
         fresh = len(names - known) / max(1, len(names))
         vectors = self.entries.embed([text, *before])
         nearest = min(1.0, max(float(vectors[0] @ other) for other in vectors[1:]))
@@ -354,7 +343,7 @@ class SimpleMemory:
             data[name] = list(dict.fromkeys([*data[name], *(n for e in largest for n in e.data[name])]))
         for entry in largest:
             self.entries.remove(entry.id)
-        self._rename()
+        self._named.rebuild(self.entries)
         self.archive = [*self.archive, *largest][-self.capacity :]
         latest = max(largest, key=lambda e: e.time.total).time
         self._put(Entry(self.services.new_id(), one_line(answer.value.text), latest, data))
@@ -374,19 +363,9 @@ class SimpleMemory:
     def _put(self, entry: Entry) -> None:
         before = self.entries.evicted
         self.entries.put(entry)
-        self._name([entry])
+        self._named.add(entry)
         if self.entries.evicted != before:
-            self._rename()
-
-    def _name(self, entries: Iterable[Entry]) -> None:
-        for entry in entries:
-            for name in entry.data["names"]:
-                self._named.setdefault(name, {})[entry.id] = None
-
-    def _rename(self) -> None:
-        """Forget the names of notes that are gone."""
-        self._named = {}
-        self._name(self.entries)
+            self._named.rebuild(self.entries)
 
     # -- state -----------------------------------------------------------------------------------------------------
 
@@ -397,7 +376,7 @@ class SimpleMemory:
             "archived": len(self.archive),
             "evicted": self.entries.evicted,
             "dropped": self._dropped,
-            "vague": sum(bool(_VAGUE.search(e.text)) for e in self.entries),
+            "vague": sum(is_vague(e.text) for e in self.entries),
         }
 
     def snapshot(self) -> bytes:
@@ -412,4 +391,4 @@ class SimpleMemory:
         self.entries.load(entries)
         self.archive = [Entry.load(row) for row in archive]
         self._window = [Step.load(s) for s in window]
-        self._rename()
+        self._named.rebuild(self.entries)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from typing import Any
 
-WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
+from agentspec.memory.simplemem.names import WORD
 
 COMPRESS = """\
 You take notes for an agent. Write what its steps taught as notes that help later: what is where (with coordinates),
