@@ -260,18 +260,20 @@ async def ask_action(
         messages = follow_up(messages, sampled(call), complaint(reading.action, schema))
 
 
-def require_variety(method: str, services: Services, temperature: float | None = None) -> None:
+def require_variety(
+    method: str, services: Services, temperature: float | None = None, *, name: str = "temperature"
+) -> None:
     """Refuse to vote among answers that cannot differ.
 
     Raises:
-        SpecError: the temperature is 0, or the model's endpoint has refused to be told one.
+        SpecError: the temperature (the parameter `name` of the method) is 0, or the model's endpoint takes none.
     """
     if temperature is None:
         temperature = services.llm.recorder.sampling.temperature
     if temperature <= 0:
         raise SpecError(
-            f"{method}: sampling_temperature must be above 0, got {temperature}; greedy samples are all the same and "
-            "cannot vote"
+            f"{method}: {name} must be above 0, got {temperature}; greedy samples are all the same and cannot vote. "
+            f"Where everything else is to be greedy, give the method its own, such as {{name: {method}, {name}: 0.7}}"
         )
     rejected = getattr(services.llm.recorder.llm, "rejected", {})
     if "temperature" in rejected:

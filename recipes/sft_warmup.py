@@ -31,12 +31,12 @@ def train_warmup(config: Any) -> None:
     from trl import SFTConfig
 
     from agentspec.files import write_atomic
+    from agentspec.records.log import RunLog
     from agentspec.tasks import make_tasks
     from trainers.card import FILE, model_card
     from trainers.config import CHECKPOINTING
     from trainers.demonstrations import DemonstrationTrainer, demonstrate
     from trainers.policy import load_policy
-    from trainers.runlog import RunLog
 
     name, options = config.world
     model, tokenizer = load_policy(config)

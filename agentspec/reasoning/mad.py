@@ -112,7 +112,7 @@ class MultiAgentDebate(Stateless):
         at_least("mad", 0, num_rounds=chosen["num_rounds"])
         at_least("mad", 0, max_retries=max_retries)
         if chosen["num_agents"] > 1:
-            require_variety("mad", services, sampling_temperature)
+            require_variety("mad", services, sampling_temperature, name="sampling_temperature")
         self.services = services
         self.max_retries = max_retries
         self.temperature = sampling_temperature
@@ -137,7 +137,7 @@ class MultiAgentDebate(Stateless):
                 self._show_others(advisers, schema)
             await self._answer(meter, advisers, schema)
             if self.agents > 1:
-                require_variety("mad", self.services, self.temperature)
+                require_variety("mad", self.services, self.temperature, name="sampling_temperature")
             if meter.exhausted:
                 break
         return self._vote(meter, advisers, schema) or await last_resort(

@@ -145,7 +145,7 @@ class SelfConsistency(Stateless):
         chosen = settings("self_consistency", PRESETS, preset, {"samples": num_samples if samples is None else samples})
         at_least("self_consistency", 1, samples=chosen["samples"])
         at_least("self_consistency", 0, max_retries=max_retries)
-        require_variety("self_consistency", services, sampling_temperature)
+        require_variety("self_consistency", services, sampling_temperature, name="sampling_temperature")
         if credit not in ("returned", "majority"):
             raise SpecError(f"self_consistency: credit must be 'returned' or 'majority', got {credit!r}")
         self.services = services
@@ -163,7 +163,7 @@ class SelfConsistency(Stateless):
         )
         meter = Meter(self.services.llm, retries=self.max_retries)
         answers = await (self._choose if schema.choices else self._answer)(meter, messages, schema)
-        require_variety("self_consistency", self.services, self.sampling["temperature"])
+        require_variety("self_consistency", self.services, self.sampling["temperature"], name="sampling_temperature")
         votes = [a for a in answers if a is not None]
         tally = Tally.of(votes, schema)
         trace = {

@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip("trl")
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from tests.trainers.builders import CPU_RUN
 from tests.trainers.test_resume import trainer
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
-from trainers.runlog import RunLog
 
 SPECS: list[dict[str, Any]] = [
     {"reasoning": {"name": "react", "thought_tokens": 4}},
