@@ -13,8 +13,8 @@ who shares a forward of the model with whom.
 Before it takes requests either way, the event loop is given a few turns, so that an episode that asks several things at
 once, or goes on at once, is complete. A continuous batch also gives those it has just answered a moment, at most a
 quarter of what its last step took, to act and ask again: episodes that were in step stay in step, and share their
-forwards from the first to the last. Where they took longer the last time, it does not wait. Requests are ordered by episode and number, and run in a worker thread while the
-loop goes on.
+forwards. Where they took longer the last time, it does not wait. Requests are ordered by episode and number, and run in
+a worker thread while the loop goes on.
 
 An episode leaves when it ends; one that fails or is cancelled without saying so leaves when the task that entered it
 ends. Requests without an episode, or from an episode that never entered, wait for nobody. As a last resort, for

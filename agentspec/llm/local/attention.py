@@ -7,12 +7,12 @@ repeated.
 
 On a CPU segments go one by one, each against blocks of keys of which those to come are hidden
 (`agentspec.llm.local.blocks`): then the order in which a token's keys are summed up depends on its position alone, not
-on how many tokens are read at once. torch's kernel takes queries in blocks of 32 (64, 256 for more), and MKL multiplies the rows of a last block of fewer than 4 by
-other kernels: such a block is filled up to 4. And a single head would be multiplied by all threads together, in pieces
-that depend on the number of queries: it is given to the kernel as several. So the same token in the same context is the
-same, bit for bit, whoever else is in the batch (`agentspec.llm.local.invariance`). Segments of one token (sequences that
-are writing) are laid out together; on an accelerator, where a launch costs more than the work, they are gathered into
-one padded batch.
+on how many tokens are read at once. torch's kernel takes queries in blocks of 32 (64, 256 for more), and MKL multiplies
+the rows of a last block of fewer than 4 by other kernels: such a block is filled up to 4. And a single head would be
+multiplied by all threads together, in pieces that depend on the number of queries: it is given to the kernel as
+several. So the same token in the same context is the same, bit for bit, whoever else is in the batch
+(`agentspec.llm.local.invariance`). The queries of segments of one token (sequences that are writing) are laid out
+together; on an accelerator, where a launch costs more than the work, the keys are too, in one padded batch.
 """
 
 from __future__ import annotations
@@ -152,9 +152,7 @@ def packed_attention(
     return out, None
 
 
-def _several(
-    pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Tensor, scores: _Scores
-) -> torch.Tensor:
+def _several(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
     """The queries (B, heads, n, size) of segments of n tokens, each to its slot in turn; (B, n, heads, size)."""
     size, heads, n = query.shape[:3]
     slots = [s.slot.layer(layer) for s in segments]
@@ -168,14 +166,14 @@ def _several(
     if rows > groups * n:
         q = torch.nn.functional.pad(q, (0, 0, 0, rows - groups * n))
     attended = []
-    for i, (segment, (keys, values)) in enumerate(zip(segments, slots, strict=True)):
+    for i, (segment, slot) in enumerate(zip(segments, slots, strict=True)):
         total = segment.start + n
         read = pack.keys(total)
-        keys, values = keys[None, :, :read], values[None, :, :read]
+        k, v = (x[None, :, :read] for x in slot)
         if alone:
-            keys, values = (x.expand(1, kv_heads, -1, -1) for x in (keys, values))
+            k, v = (x.expand(1, kv_heads, -1, -1) for x in (k, v))
         mask = _causal_mask(pack, n, total, read, groups, rows, scores.window, q)
-        attended.append(_attend(q[i : i + 1], keys, values, mask, groups, n, scores))
+        attended.append(_attend(q[i : i + 1], k, v, mask, groups, n, scores))
     o = torch.cat(attended)[:, :, : groups * n]
     return o.reshape(size, -1, n, o.shape[-1])[:, :heads].transpose(1, 2)
 

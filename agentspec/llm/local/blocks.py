@@ -42,7 +42,7 @@ def last_blocks(size: int, threads: int) -> tuple[int, ...]:
     draw = torch.Generator().manual_seed(0)
     keys, values = (torch.randn(1, 2, WHOLE, size, generator=draw) for _ in range(2))
     queries = torch.randn(1, 2, max(_ROWS), size, generator=draw)
-    return tuple(n for n in range(STEP, WHOLE, STEP) if _same(queries, keys, values, n)) + (WHOLE,)
+    return (*(n for n in range(STEP, WHOLE, STEP) if _same(queries, keys, values, n)), WHOLE)
 
 
 def _same(queries: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, n: int) -> bool:

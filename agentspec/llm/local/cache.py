@@ -8,8 +8,8 @@ them:
 - any other slot (the same static prompt in another episode, another module's view of this episode) is *copied* up to
   the common prefix. Copying a token costs about a hundredth of computing it.
 
-The least recently used slots go first when the bound on tokens is passed, which running calls count towards. Adapters share the bound, and nothing else:
-keys and values that one adapter computed are never found by another.
+The least recently used slots go first when the bound on tokens is passed, which running calls count towards. Adapters
+share the bound, and nothing else: keys and values that one adapter computed are never found by another.
 """
 
 from __future__ import annotations
