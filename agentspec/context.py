@@ -68,6 +68,8 @@ class Context:
         self.carry = ""
         self.plan = ""
         """What the agent last wrote into an answer as its plan."""
+        self.transcript = ""
+        """The transcript that the reasoner's prompt of this step shows, for those who judge what it decides."""
         self.pictures: tuple[Picture, ...] = ()
         """What the current step sees: part of its prompts, and of nothing that is kept."""
         self._count = count_tokens

@@ -8,8 +8,9 @@ without a sign is left open: a reader, or a model, has to judge it.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -40,7 +41,7 @@ RECENT = 8
 COPIED = 80
 """Characters of an earlier text in an answer that is no action, from which on it counts as copied."""
 
-_PARAMETER = ("PARSE_ARGS", "ARGS", "RANGE")
+_PARAMETER = ("PARSE_ARGS", "ARGS", "RANGE", "missing_argument")
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,7 @@ def signs(trajectory: Trajectory) -> list[Sign]:
     """Everything the rules find, in the order of steps: those of any world, then those of this one."""
     from agentspec.envs.making import environment_class
 
-    found = list(_unreadable(trajectory.transitions))
-    taken = {sign.step for sign in found}
-    found += [sign for sign in _repeated_errors(trajectory.transitions) if sign.step not in taken]
+    found = [*_unreadable(trajectory.transitions), *_repeated_errors(trajectory.transitions)]
     own = getattr(environment_class(trajectory.task.env), "failure_signs", "")
     if own:
         module, _, name = own.partition(":")
@@ -117,10 +116,12 @@ def _reason(t: Transition, error: ActionError | None) -> str:
 
 
 def _copies(text: str, earlier: Sequence[str]) -> bool:
+    """Whether a run of it stands in an earlier text, however both are broken into lines."""
+    text, *shown = (" ".join(one.split()) for one in (text, *earlier))
     if len(text) < COPIED:
         return False
     windows = (text[i : i + COPIED] for i in range(0, len(text) - COPIED + 1, COPIED // 4))
-    return any(window in shown for window in windows for shown in earlier)
+    return any(window in one for window in windows for one in shown)
 
 
 def _repeated_errors(transitions: Sequence[Transition]) -> Iterator[Sign]:
@@ -136,6 +137,14 @@ def _repeated_errors(transitions: Sequence[Transition]) -> Iterator[Sign]:
             why = f"{t.action_text} failed {i - before} steps ago for the same reason: {key[1]}"
             yield Sign(f"understanding/state_confusion/{kind}", t.step, why[:200])
         refused[key] = i
+
+
+def in_vain_again(transitions: Sequence[Transition], in_vain: Callable[[Transition], bool]) -> Iterator[Sign]:
+    """Steps at which what came to nothing just before is done again, for worlds that do not call it an error."""
+    for before, t in itertools.pairwise(transitions):
+        if t.action_text == before.action_text and in_vain(before) and in_vain(t):
+            why = f"{t.action_text} came to nothing just before"
+            yield Sign("understanding/state_confusion/history_misunderstood", t.step, why[:200])
 
 
 def revisits(keys: Sequence[object], times: int = 3) -> Iterator[int]:

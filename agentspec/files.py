@@ -10,10 +10,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import socket
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from agentspec.registry import SpecError
 
 LONE = "backslashreplace"
 """What becomes of half a surrogate pair, which endpoints answer and no file can hold: its JSON escape."""
@@ -35,6 +39,38 @@ def write_atomic(path: str | Path, data: str | bytes) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def held(path: str | Path, refusal: str, remedy: str, *, again: bool = False) -> Iterator[None]:
+    """Inside, nobody else holds the file.
+
+    The operating system holds the lock, so that it is gone when its holder is, however that ended. The file stays, and
+    names its holder while there is one.
+
+    Args:
+        again: whether its holder may hold it once more, in a block within.
+
+    Raises:
+        SpecError: `refusal`, who holds it, and `remedy`.
+    """
+    from filelock import FileLock, Timeout
+
+    path = Path(path).resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path, timeout=0, is_singleton=again)  # one object per path may be acquired again
+    try:
+        lock.acquire()
+    except Timeout:
+        who = path.read_text(encoding="utf-8") or "it is starting or ending"
+        raise SpecError(f"{refusal} ({who}); {remedy}") from None
+    try:
+        path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        if lock.lock_counter == 1:  # the outermost block
+            path.write_text("", encoding="utf-8")
+        lock.release()
 
 
 def jsonable(value: Any) -> Any:

@@ -13,6 +13,12 @@ class SpecError(ValueError):
     """A spec, name or configuration that cannot work: what was given, what was expected, what to do."""
 
 
+def look_here() -> None:
+    """From now on what lies in the working directory can be imported; it replaces nothing that is installed."""
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.append(str(Path.cwd()))
+
+
 def import_module(name: str) -> ModuleType:
     """The module of that name, or of that Python file.
 
@@ -22,8 +28,7 @@ def import_module(name: str) -> ModuleType:
     path = Path(name)
     if path.suffix == ".py" or "/" in name:
         return _import_file(path)
-    if str(Path.cwd()) not in sys.path and "" not in sys.path:
-        sys.path.append(str(Path.cwd()))  # at the end: what lies there replaces nothing that is installed
+    look_here()
     try:
         return importlib.import_module(name)
     except Exception as error:

@@ -25,9 +25,12 @@ MAX_LENGTH = 4000
 """Longer calls are refused: no action is this long, and deeply nested input must not reach the parser."""
 
 _QUOTED = re.compile(r"(\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^'\\])*')", re.DOTALL)
+_WORDS_ALONE = re.compile(r"\s*[A-Za-z][^\"'()\[\]{}=\n]*[ :;>][^\"'()\[\]{}=\n]*\w\s*")
+_PERCENT = re.compile(r"(?<=\d)\s?%(?=\s*(?:,|$))")
 _COLON = re.compile(r"(^|[(,]\s*)([A-Za-z_]\w*)\s*:\s*")
 _OPENING, _CLOSING = {"(": ")", "[": "]", "{": "}"}, frozenset(")]}")
 _NUMBERS = ("int", "float")
+_MANY = ("list", "any")
 _WORDS = {"true": True, "false": False, "none": None, "null": None}
 
 
@@ -54,7 +57,8 @@ def suggest(name: str, known: Iterable[Any]) -> str:
 def known_name(name: str, schema: ActionSchema) -> str | None:
     """The canonical name that `name` stands for, up to case, joining signs and a prefix (`functions.MOVE`)."""
     found = _names(schema).get(_squash(name))
-    return found or _names(schema).get(_squash(name.rpartition(".")[2]))
+    prefix, _, last = name.rpartition(".")
+    return found or (None if " " in prefix.strip() else _names(schema).get(_squash(last)))
 
 
 def _names(schema: ActionSchema) -> dict[str, str]:
@@ -110,7 +114,9 @@ def parse_call(call: Call, schema: ActionSchema) -> Action | ActionError:
         problem = f"there is no action {call.name.upper()}{suggest(call.name, schema.actions)}"
         return ActionError("PARSE_UNKNOWN", problem, call.text[:200])
     try:
-        args, kwargs = _fitted(*_arguments(call.arguments, schema), name, schema)
+        attached = call.text[len(call.name) :].startswith("(")
+        arguments = _quoted_alone(call.arguments, name, schema) if attached else call.arguments
+        args, kwargs = _fitted(*_arguments(arguments, schema), name, schema)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
         example = schema.actions[name].example or name
         reason = error.msg if isinstance(error, SyntaxError) else error
@@ -136,8 +142,19 @@ def _shown(value: Any, schema: ActionSchema) -> str:
     return repr(value)
 
 
+def _quoted_alone(arguments: str, name: str, schema: ActionSchema) -> str:
+    """The arguments; words without quotes get them where the action takes one text: `PICKUP(apple 1)`."""
+    known = schema.actions[name].parameters
+    only = next(iter(known), "")
+    named = re.match(rf"\s*{only}\s*[:=]\s*", arguments)
+    words = arguments[named.end() :] if named else arguments
+    if len(known) != 1 or known[only].type != "str" or not _WORDS_ALONE.fullmatch(words):
+        return arguments
+    return f"{only}={json.dumps(words.strip())}" if named else json.dumps(words.strip())
+
+
 def _arguments(text: str, schema: ActionSchema) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    text = _apply_units(text.strip(), schema)
+    text = _apply_units(_outside_quotes(text.strip(), lambda part: _PERCENT.sub("", part)), schema)
     try:
         tree = ast.parse(f"f({text})", mode="eval").body
     except SyntaxError:
@@ -170,12 +187,29 @@ def _fitted(
         missing = [p for p in point[len(args) :] if p not in kwargs]
         if missing:
             raise ValueError(f"it needs {' and '.join(missing)}")
+    if len(parameters) == 1 and len(args) > 1 and not kwargs and parameters[next(iter(parameters))].type in _MANY:
+        args = (list(args),)  # ACCEPT_ORDER(3, 7)
+    for p, value in (*zip(parameters, args, strict=False), *kwargs.items()):
+        if p in parameters and parameters[p].type in _NUMBERS and isinstance(value, str):
+            _number(value, p, schema)
     single = {p for p, known in parameters.items() if known.type in _NUMBERS or known.enum}
     names = itertools.chain(parameters, itertools.repeat(""))
     return (
         tuple(_alone(value, p) if p in single else value for value, p in zip(args, names, strict=False)),
         {p: _alone(value, p) if p in single else value for p, value in kwargs.items()},
     )
+
+
+def _number(text: str, name: str, schema: ActionSchema) -> float:
+    """The number that a text holds, with a unit or without.
+
+    Raises:
+        ValueError: it holds none.
+    """
+    try:
+        return float(_apply_units(text.strip(), schema))
+    except ValueError:
+        raise ValueError(f"{name} must be a number, not {text[:40]!r}") from None
 
 
 def _taken_apart(
@@ -188,7 +222,7 @@ def _taken_apart(
         given = [{str(key).casefold(): value for key, value in given.items()}.get(p) for p in point]
     if not isinstance(given, list) or len(given) != len(point) or None in given or set(point) & set(kwargs):
         return args, kwargs
-    numbers = [float(_apply_units(v.strip(), schema)) if isinstance(v, str) else v for v in given]
+    numbers = [_number(v, p, schema) if isinstance(v, str) else v for v, p in zip(given, point, strict=True)]
     return (*numbers, *args[1:]), kwargs if args else {k: v for k, v in kwargs.items() if k != loose[0]}
 
 

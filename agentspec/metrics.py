@@ -137,6 +137,15 @@ def figures(trajectory: Trajectory) -> dict[str, float]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def means(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of each number over the rows that have it, in the order in which they appear."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            found.setdefault(name, []).append(value)
+    return {name: math.fsum(values) / len(values) for name, values in found.items()}
+
+
 def episode_row(trajectory: Trajectory) -> dict[str, Any]:
     """One episode as a flat row of JSON values.
 

@@ -49,6 +49,22 @@ def one_of(method: str, **values: tuple[str, tuple[str, ...]]) -> None:
             raise SpecError(f"{method}: {name} must be one of {', '.join(allowed)}; got {value!r}")
 
 
+def without_effect(method: str, needed: str, **given: bool) -> None:
+    """Refuse parameters that were given although they would change nothing: `name=whether it was given`.
+
+    Args:
+        method: the module.
+        needed: what they need to have an effect, as it is written in a spec.
+        given: parameter -> whether it differs from its default.
+
+    Raises:
+        SpecError: naming them and what they need.
+    """
+    idle = [name for name, is_given in given.items() if is_given]
+    if idle:
+        raise SpecError(f"{method}: {', '.join(idle)} would change nothing without {needed}; add it, or leave them out")
+
+
 def parameters_of(target: Any) -> list[str]:
     """Names of the keyword parameters of a module class (`services` is the scaffold's)."""
     return [p for p in inspect.signature(target).parameters if p != "services"]

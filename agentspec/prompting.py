@@ -26,6 +26,7 @@ from agentspec.llm.base import Message, assistant, user
 from agentspec.reading import Reading, read
 from agentspec.registry import SpecError
 from agentspec.services import Services
+from agentspec.tokens import excerpt
 from agentspec.types import Action, ActionError, ActionSchema, AgentInput, LLMCall, Recall, Sampled
 from agentspec.visible import visible
 
@@ -62,14 +63,19 @@ def render_actions(schema: ActionSchema) -> str:
     return "\n".join(lines)
 
 
-def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "") -> str:
+def user_turn(input: AgentInput, recall: Recall, services: Services, *, transcript: str = "", steps: int = 0) -> str:
     """Lessons and memory within the spec's budgets, a method's own transcript of the steps, then the observation.
 
     Steps that the transcript or the conversation tells are not told again by a memory (items of kind `step` and
     `failure`, one for each of the newest steps); of a conversation's, failures stay whose reason it does not give.
+
+    Args:
+        transcript: what a method itself tells of the newest `steps` steps.
     """
+    services.context.transcript = transcript
     if transcript:
-        recall = Recall(tuple(item for item in recall.items if item.kind not in STEPS))
+        told = [i for i, item in enumerate(recall.items) if item.kind in STEPS][-steps:]
+        recall = Recall(tuple(item for i, item in enumerate(recall.items) if i not in told))
         transcript = TRANSCRIPT.format(text=transcript)
     elif services.context.told:
         recall = _untold(recall, services, input.text)
@@ -153,6 +159,8 @@ class Step:
 def course(steps: Sequence[Step], budget: int, services: Services) -> str:
     """Numbered steps. Every action and thought stays; what was observed shares what they leave of `budget` tokens.
 
+    Of a long observation every paragraph is told in part, and a mark stands where it was cut.
+
     The newest observation gets as much as it needs of half the room, older ones equal parts of the rest.
     """
     bare = [_step(i, step, "") for i, step in enumerate(steps, 1)]
@@ -161,7 +169,7 @@ def course(steps: Sequence[Step], budget: int, services: Services) -> str:
     waiting = [i for i in reversed(range(len(steps))) if steps[i].seen]
     for number, i in enumerate(waiting):
         share = left // 2 if number == 0 and len(waiting) > 1 else left // (len(waiting) - number)
-        text = clip(" ".join(steps[i].seen.split()), share, services) if share > 0 else ""
+        text = excerpt(steps[i].seen, share, services.llm.count_tokens) if share > 0 else ""
         shown[i] = text
         left -= services.llm.count_tokens(text)
     return "\n".join(_step(i, step, seen) for i, (step, seen) in enumerate(zip(steps, shown, strict=True), 1))

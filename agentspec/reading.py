@@ -7,8 +7,11 @@ In this order:
 2. An action given as data (JSON, a tool call; `agentspec.shapes`) counts where it comes before any `Action:` line.
 3. The *first* `Action:` line counts, in any case and dress, its call on the same or a later line (`agentspec.values`).
    Whatever follows it, an invented observation or a second turn, is dropped.
-4. Without a label: a line that is a call (or a menu entry), numbered, quoted or with a remark after it.
-5. A single call in a sentence, where it is marked as code or closes the answer, and is not negated.
+4. Without a label: what "Decision:" or the like introduces; a line that is a call (or a menu entry), numbered, quoted
+   or with a remark after it; of a list of several, the one that stands by itself below it.
+5. A single call in a sentence, marked as code or closing the answer, and neither denied nor only spoken of.
+
+Where the answer leaves open which of several actions is meant, or takes it back (`agentspec.remarks`), it holds none.
 
 Everything else is an `ActionError` whose message tells the model what to write; an answer that was cut off before its
 action is told apart (`TRUNCATED`). The text of an error never reads as an action itself, so that whoever passes it on
@@ -22,10 +25,10 @@ from dataclasses import dataclass, replace
 
 from agentspec import literals, shapes
 from agentspec.literals import known_name, parse_call, scan_call
-from agentspec.remarks import is_meant
+from agentspec.remarks import chooses_later, corrected, is_meant, only_spoken_of, stands
 from agentspec.types import Action, ActionError, ActionSchema
-from agentspec.values import CALL, DRESS, MOST_CALLS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, squeeze
-from agentspec.visible import undressed, visible
+from agentspec.values import CALL, DRESS, REMARK, SPACED_CALL, SQUARE, WORD, Values, first_line, same_call, squeeze
+from agentspec.visible import bounded, undressed, visible
 
 _LABEL = re.compile(
     r"^[ \t>#*_\-•\"'`{]{0,40}(?:\(?\d{1,4}[.):][ \t]*)?[\"'*_` \t]{0,40}"
@@ -36,18 +39,21 @@ _LABEL = re.compile(
 )
 _HEADING = re.compile(r"^[ \t]*#+[ \t]*(?:final |next )?action[ \t:]*$", re.IGNORECASE | re.MULTILINE)
 _MID_LABEL = re.compile(r"\b(?:final |next )?action[ \t*_`]*:", re.IGNORECASE)
+_FINAL = re.compile(r"^[ \t>#*_\-•]{0,40}final[ \t]+(?:action|answer)[ \t*_`]*:[ \t*_]*", re.IGNORECASE | re.MULTILINE)
 _TURN = re.compile(
     r"^\W{0,4}(?:observation|user|human|environment|system|result)[ \t]*\d*[ \t*_]*:", re.I | re.MULTILINE
 )
 _THOUGHT = re.compile(r"^[ \t>#*_\-]*(?:thoughts?|reasoning|plan|analysis|rationale)[ \t]*\d*[ \t*_]*:", re.IGNORECASE)
 _FENCE = re.compile(r"^[ \t]*(?:```|~~~)[\w+\-]*[ \t]*", re.MULTILINE)
 _BULLET = re.compile(r"^[ \t>]*(?:[*•\-]|\(?\d{1,2}[.):])[ \t]+")
-_NEGATED = re.compile(
-    r"(?:\bnot|n't|\bnever|\bavoid(?:ing)?|\binstead of|\brather than|\bwithout|\bcannot)\W+(?:\w+\W+)?$", re.I
+_BRANCH = re.compile(r"^[ \t]*(?:if|elif|else|while|for)\b[^\n]*:[ \t]*$", re.MULTILINE)
+_WEAK_LABEL = re.compile(
+    r"^[ \t>#*_\-•]{0,40}(?:(?:final|next|chosen|my|the|best|selected|recommended|first)[ \t]+)*"
+    r"(?:decision|choice|pick|move|step(?: now)?|conclusion|verdict|aktion|acción|ação|действие|动作|行动|操作|行動)"
+    r"[ \t*_`]*:[ \t*_]*",
+    re.IGNORECASE | re.MULTILINE,
 )
-
-LONGEST = 50_000
-"""Signs of an answer that are read: of a longer one the beginning and the end, half each."""
+"""What may introduce an action, if one follows."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +80,10 @@ def read(text: str, schema: ActionSchema, *, cut: bool = False) -> Reading:
     if plain_action is not None:
         return Reading(plain_action, explicit=text in schema.choices)
     shown, open_block = visible(text)
-    plain = undressed(_bounded(shown))
+    plain = undressed(bounded(shown))
     reading = _Reader(plain, schema).read() if plain else Reading(_no_action("", schema))
     if isinstance(reading.action, Action):
-        plan = shapes.plan_of(_bounded(shown))
+        plan = shapes.plan_of(bounded(shown))
         return replace(reading, action=replace(reading.action, plan=plan)) if plan else reading
     error = reading.action
     if (cut or open_block) and error.code not in ("PARSE_UNKNOWN", "PARSE_ARGS"):
@@ -138,23 +144,62 @@ class _Reader:
         if choice is not None:
             return Reading(Action(choice, text=choice), explicit=True)
         label = _HEADING.search(self.text) or _LABEL.search(self.text)
-        shape = shapes.find_shape(self.text, self.schema)
+        shape = shapes.find_shape(self.text, self.schema, loose=label is None)
         if shape is not None and (label is None or shape.start <= label.end()):
             thought = shape.thought or _thought(self.text[: min(shape.start, label.start() if label else shape.start)])
-            return Reading(self.values.read(shape.text) or self._nothing(shape.text), thought, explicit=True)
+            later = chooses_later(self.text[shape.start :].rpartition("]")[2])
+            said = self._several() if later else self.values.read(shape.text)
+            return Reading(said or self._nothing(shape.text), thought, explicit=True)
         if label is not None:
             thought = _thought(self.text[: label.start()])
             value = self.text[label.end() :]
-            return Reading(self.values.read(value) or self._nothing(first_line(value)), thought, explicit=True)
-        found = self._line()
+            said = self.values.read(value)
+            if isinstance(said, Action) and not (self._stands(value, said) and self._is_final(value, said)):
+                said = self._several()
+            return Reading(said or self._nothing(first_line(value)), thought, explicit=True)
+        self.text = shapes.without_data(self.text)
+        found = self._decided() or self._line()
         if found is None:
-            inline = _MID_LABEL.search(self.text)
-            meant = self.values.read(self.text[inline.end() :]) if inline else None
-            found = (meant, inline.start()) if inline and meant else None
+            found = self._inline()
+        action: Action | ActionError | None
         action, at = found or (self._mention(), len(self.text))
+        if isinstance(action, Action) and chooses_later(self.text[at + len(action.text) :]):
+            action = self._several()
         if action is None:
             return Reading(self._nothing(self.text), _thought(self.text))
         return Reading(action, _thought(self.text[:at]))
+
+    def _stands(self, text: str, action: Action) -> bool:
+        """Whether what follows `action` in `text` leaves it as it is."""
+        at = text.casefold().find(action.text.casefold())
+        rest, _, following = text[at + len(action.text) :].partition("\n") if at >= 0 else ("", "", "")
+        if action.text in self.schema.choices:
+            return not corrected(following)
+        return stands(rest, following, self.values.other(rest, action))
+
+    def _is_final(self, text: str, action: Action) -> bool:
+        """Whether no "Final action:" after `action` names another one."""
+        final = _FINAL.search(text)
+        said = self.values.read(text[final.end() :]) if final else None
+        return not isinstance(said, Action) or same_call(said, action)
+
+    def _inline(self) -> tuple[Action | ActionError, int] | None:
+        """What stands behind "action:" in the middle of a line, unless it is the last, a wrong or another such one."""
+        labels = [m for m in _MID_LABEL.finditer(self.text) if not only_spoken_of(self.text[: m.end() - 1], "")]
+        meant = self.values.read(self.text[labels[0].end() :]) if labels else None
+        return (meant, labels[0].start()) if meant else None
+
+    def _several(self, what: str = "leaves open which action is meant") -> ActionError:
+        return ActionError("PARSE_AMBIGUOUS", f"the answer {what}; answer with one of them", self.text)
+
+    def _decided(self) -> tuple[Action | ActionError, int] | None:
+        """The action of the last line that says "Decision:" or the like and gives one."""
+        for label in reversed(list(_WEAK_LABEL.finditer(self.text))[-8:]):
+            value = self.text[label.end() :]
+            action = self.values.read(value) if value[:1] not in ("", "\n") else None
+            if isinstance(action, Action) and self._stands(value, action):
+                return action, label.start()
+        return None
 
     def _nothing(self, text: str) -> ActionError:
         return _no_action(text.strip(), self.schema)
@@ -163,6 +208,7 @@ class _Reader:
         """The first line that is an action, and where it begins; an error where a list leaves open which is meant."""
         found: list[tuple[Action | ActionError, int, bool]] = []
         at, prose_after = 0, False
+        branches = _BRANCH.search(self.text) is not None
         for line in self.text.splitlines(keepends=True):
             start, at = at, at + len(line)
             if found and _TURN.match(line):
@@ -170,17 +216,25 @@ class _Reader:
             window = self.text[start : at + literals.MAX_LENGTH]
             action = None if not line.strip() or _THOUGHT.match(line) else self._action_line(window, line)
             if action is not None:
-                found.append((action, start, bool(_BULLET.match(line))))
-                prose_after = False
+                found.append((action, start, branches or bool(_BULLET.match(line))))
+                prose_after = prose_after and not found[-1][2]
             else:
                 prose_after = prose_after or bool(DRESS.sub("", line).strip())
-            if found and not found[0][2]:
+            if found and not found[-1][2]:
                 break  # not a list: the first counts
-        actions = {a.text for a, _, _ in found if isinstance(a, Action)}
-        if len(actions) > 1 and prose_after and all(bullet for _, _, bullet in found):
-            problem = f"the answer lists several actions ({'; '.join(sorted(actions)[:3])}); answer with one of them"
-            return ActionError("PARSE_AMBIGUOUS", problem, self.text), found[0][1]
-        return (found[0][0], found[0][1]) if found else None
+        return self._listed(found, prose_after=prose_after or branches) if found else None
+
+    def _listed(
+        self, found: list[tuple[Action | ActionError, int, bool]], *, prose_after: bool
+    ) -> tuple[Action | ActionError, int]:
+        """The first of (action, where, whether in a list); or what stands by itself below a list of several."""
+        actions, listed = ({a.text for a, _, i in found if (i or any_) and isinstance(a, Action)} for any_ in (1, 0))
+        alone = [(a, start) for a, start, in_list in found if not in_list]
+        if alone and len(listed) > 1:
+            return alone[0]
+        if len(actions) > 1 and (prose_after or (alone and listed)):
+            return self._several(f"lists several actions ({'; '.join(sorted(actions)[:3])})"), found[0][1]
+        return found[0][0], found[0][1]
 
     def _action_line(self, text: str, line: str) -> Action | ActionError | None:
         """The action that `text` begins with if its first line, `line`, is nothing but an action and a remark."""
@@ -189,12 +243,17 @@ class _Reader:
         choice = self.values.choice(bare)
         if choice is not None:
             return choice
+        bare = bare[1:] if bare[:1] == "[" and CALL.match(bare, 1) else bare
         match = CALL.match(bare) or SPACED_CALL.match(bare)
         if match is not None:
             action = self.values.call(bare, match)
             whole = scan_call(bare, match) if action is not None else None
             known = known_name(match.group(1), self.schema) is not None
-            if action is None or whole is None or not REMARK.match(bare, whole.end):
+            rest, _, following = bare[whole.end :].partition("\n") if whole is not None else ("", "", "")
+            if isinstance(action, Action) and not stands(rest, following, self.values.other(rest, action)):
+                return None
+            remark = whole is not None and (REMARK.match(bare, whole.end) or self.values.only_calls(rest))
+            if action is None or whole is None or not remark:
                 # `MOVE(1)(2)` is an action gone wrong, "I think (perhaps) so" is none.
                 return action if known and isinstance(action, ActionError) else None
             alone = CALL.match(bare) is not None and not bare[whole.end :].strip(" \t\n`*.;\"'")
@@ -215,33 +274,15 @@ class _Reader:
         turn = _TURN.search(self.text)
         text = self.text[: turn.start()] if turn and turn.start() else self.text
         text = "".join("" if _THOUGHT.match(line) else line for line in text.splitlines(keepends=True))
-        found: list[tuple[Action, int, int]] = []
-        for match in CALL.finditer(text):
-            if known_name(match.group(1), self.schema) and self.values.scans < MOST_CALLS:
-                action = self.values.call(text, match)
-                whole = scan_call(text, match)
-                if isinstance(action, Action) and whole is not None:
-                    found.append((action, match.start(), whole.end))
+        found = self.values.calls_in(text)
         spoken = not found
-        if spoken:
-            found = self._mentioned_choices(text)
+        found = found or self.values.entries_in(text)
         if len({repr((a.name, a.args, a.kwargs)) for a, _, _ in found}) != 1:
             return None
         action, start, end = found[-1]
         marked = text[start - 1 : start] in ("`", "*", '"', "'") and text[end : end + 1] in ("`", "*", '"', "'")
         closing = not text[end:].strip(" \t\n.!;:*`\"')]}") and (not spoken or is_meant(text[:start]))
-        return action if (marked or closing) and not _NEGATED.search(text[:start].rstrip("`*\"' ") + " ") else None
-
-    def _mentioned_choices(self, text: str) -> list[tuple[Action, int, int]]:
-        """Menu entries in prose, the longest at each place."""
-        found: list[tuple[Action, int, int]] = []
-        for choice in sorted(self.schema.choices, key=len, reverse=True):
-            for match in re.finditer(rf"(?<!\w){re.escape(choice)}(?!\w)", text, re.IGNORECASE):
-                if len(found) >= MOST_CALLS:
-                    break
-                if not any(s < match.end() and match.start() < e for _, s, e in found):
-                    found.append((Action(choice, text=choice), match.start(), match.end()))
-        return sorted(found, key=lambda f: f[1])
+        return action if (marked or closing) and not only_spoken_of(text[:start], text[end:]) else None
 
 
 def _first_spoken(text: str) -> int:
@@ -252,12 +293,6 @@ def _first_spoken(text: str) -> int:
             return at
         at += len(line)
     return len(text)
-
-
-def _bounded(text: str) -> str:
-    """A text that is too long to be read loses its middle."""
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[:half]}\n{text[-half:]}"
 
 
 def _thought(text: str) -> str:

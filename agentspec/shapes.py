@@ -41,6 +41,12 @@ ARGUMENTS = (
     "action_args",
     "input",
 )
+ASIDE = re.compile(
+    r"(?:last|previous|prev|past|old|failed|rejected|considered|not|invalid)(?:_\w+)?|history|alternatives?|options?|"
+    r"candidates?|examples?|observations?|memory|plan|future_plan|next_actions",
+    re.IGNORECASE,
+)
+"""Keys beside or around an action whose values are not the one that is meant."""
 THOUGHTS = ("thought", "thoughts", "reasoning", "rationale", "explanation", "analysis", "reason")
 PLANS = ("plan", "future_plan")
 MAX_PLAN = 500
@@ -70,20 +76,68 @@ class Shape:
     thought: str = ""
 
 
-def find_shape(text: str, schema: ActionSchema, start: int = 0) -> Shape | None:
-    """The first action given as data in `text` from `start` on."""
+def find_shape(text: str, schema: ActionSchema, start: int = 0, *, loose: bool = True) -> Shape | None:
+    """The first action given as data in `text` from `start` on; `loose`: also the only action that data hold anywhere,
+    under whatever key.
+    """
     tag = _FUNCTION.search(text, start)
     tagged = _from_tag(text, tag, schema) if tag else None
-    tried = 0
+    tried, end = 0, start
     for match in re.finditer(r"[{\[]", text[start:]):
         at, tried = start + match.start(), tried + 1
         if (tagged and at > tagged.start) or tried > MOST_OBJECTS:
             break
-        data = _decode(text, at)
-        found = from_data(data, schema) if isinstance(data, dict | list) else None
+        if at < end:
+            continue  # within data whose only action, if any, was looked for
+        data, after = _decode(text, at)
+        if not isinstance(data, dict | list):
+            continue
+        found = from_data(data, schema) or _within(data, schema, loose=loose)
         if found is not None:
             return Shape(found, at, _thought(data))
+        end = after
     return tagged
+
+
+def without_data(text: str) -> str:
+    """`text` without the JSON objects that begin its lines: what is told in one is no action beside it."""
+    kept, at, tried = [], 0, 0
+    for match in re.finditer(r"^[ \t`]*(?=\{)", text, re.MULTILINE):
+        tried += 1
+        if match.end() < at or tried > MOST_OBJECTS:
+            continue
+        data, after = _decode(text, match.end())
+        if isinstance(data, dict) and data and all(isinstance(key, str) for key in data):
+            kept.append(text[at : match.end()])
+            at = after
+    return "".join([*kept, text[at:]])
+
+
+def _within(data: Any, schema: ActionSchema, *, loose: bool) -> str | None:
+    """The only action inside `data` that names none itself; `None` if there is none, or if there are several."""
+    found: list[str] = []
+    waiting = [data]
+    while waiting and len(found) < 2:
+        value = waiting.pop(0)
+        inner = from_data(value, schema) if isinstance(value, dict) and value is not data else None
+        if inner is None and loose and isinstance(value, str) and _is_action(value, schema):
+            inner = value.strip()
+        if inner is not None:
+            found += [inner] if inner not in found else []
+        elif isinstance(value, dict):
+            aside = (*THOUGHTS, *PLANS)
+            waiting += [v for k, v in value.items() if not ASIDE.fullmatch(str(k)) and str(k).casefold() not in aside]
+        elif isinstance(value, list):
+            waiting += value
+    return found[0] if len(found) == 1 else None
+
+
+def _is_action(text: str, schema: ActionSchema) -> bool:
+    """Whether `text` is one call, or an entry of the menu, and nothing else."""
+    text = text.strip()
+    call = re.match(r"([A-Za-z_][\w.]{0,60})\(", text)
+    known = call is not None and known_name(call.group(1), schema) is not None
+    return text in schema.choices or (known and call is not None and scan_arguments(text, call.end() - 1) == len(text))
 
 
 def plan_of(text: str) -> str:
@@ -113,31 +167,32 @@ def _from_tag(text: str, tag: re.Match[str], schema: ActionSchema) -> Shape | No
     )
     kwargs: dict[str, Any] = {a or b or c: _scalar(value) for a, b, c, value in _PARAMETER.findall(rest)}
     brace = rest.find("{")
-    data = _decode(rest, brace) if not kwargs and brace >= 0 else None
+    data = _decode(rest, brace)[0] if not kwargs and brace >= 0 else None
     return Shape(_build(name, data if isinstance(data, dict) else kwargs, schema), tag.start())
 
 
 def _scalar(text: str) -> Any:
     """A parameter between tags: JSON where it is a list or an object, otherwise the text itself."""
     if text[:1] in "[{":
-        data = _decode(text, 0)
+        data = _decode(text, 0)[0]
         return text if data is None else data
     return text
 
 
-def _decode(text: str, at: int) -> Any:
-    """The JSON (or Python) data that begins at offset `at`; `None` if it cannot be read."""
+def _decode(text: str, at: int) -> tuple[Any, int]:
+    """The JSON (or Python) data that begins at offset `at`, and where it ends; `None` if it cannot be read."""
     try:
-        return json.JSONDecoder().raw_decode(text, at)[0]
+        data, end = json.JSONDecoder().raw_decode(text, at)
+        return data, end
     except (ValueError, RecursionError):
         pass
-    end = scan_arguments(text, at)
-    if end is None:
-        return None
+    after = scan_arguments(text, at)
+    if after is None:
+        return None, at
     try:
-        return literal(ast.parse(_COMMENT.sub("", text[at:end]), mode="eval").body)
+        return literal(ast.parse(_COMMENT.sub("", text[at:after]), mode="eval").body), after
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
-        return None
+        return None, at
 
 
 def from_data(data: Any, schema: ActionSchema, depth: int = 0) -> str | None:  # noqa: PLR0911  # one line per shape
@@ -182,7 +237,7 @@ def _named(key: str, value: str, keys: Mapping[str, Any], schema: ActionSchema) 
         known = {p.casefold(): p for p in schema.actions[name].parameters}
         given = {known[k]: v for k, v in keys.items() if k in known and k != key}
     if isinstance(given, str):
-        decoded = _decode(given.strip(), 0) if given.strip()[:1] in ("{", "[") else None
+        decoded = _decode(given.strip(), 0)[0] if given.strip()[:1] in ("{", "[") else None
         if decoded is None and given.strip():
             return f"{name}({given.strip()})"
         given = decoded

@@ -10,6 +10,7 @@ never changed) keeps its JSON once it is written, so that a snapshot is the join
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -17,7 +18,17 @@ from typing import Any
 
 from agentspec.files import write_atomic
 
-__all__ = ["Json", "Record", "dump_state", "joined", "keyed", "load_state", "write_atomic"]
+__all__ = [
+    "Json",
+    "Record",
+    "dump_random",
+    "dump_state",
+    "joined",
+    "keyed",
+    "load_random",
+    "load_state",
+    "write_atomic",
+]
 
 
 _CONTAINERS = (dict, list, tuple)
@@ -80,6 +91,17 @@ def dump_state(data: Any) -> bytes:
 def load_state(blob: bytes) -> Any:
     """What `dump_state` wrote."""
     return json.loads(blob.decode())
+
+
+def dump_random(rng: random.Random) -> bytes:
+    """The state of a generator."""
+    return json.dumps(rng.getstate()).encode()
+
+
+def load_random(rng: random.Random, blob: bytes) -> None:
+    """Put a generator back into the state of `dump_random`."""
+    version, numbers, gauss = json.loads(blob)
+    rng.setstate((version, tuple(numbers), gauss))
 
 
 def _text(data: Any) -> str:

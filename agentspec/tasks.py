@@ -1,8 +1,8 @@
 """What to play: tasks by split, and labelled sets of them.
 
 Shared by training, evaluation and the command line. Splits are ranges of seeds: where every seed starts another
-episode, a policy is never tested on what it was trained on. A finite suite repeats its episodes, and keeps nothing
-apart.
+episode, a policy is never tested on what it was trained on. A finite suite repeats its episodes, whatever the split:
+`episode_key` tells them apart.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from agentspec.envs.making import short_names
+from agentspec.envs.making import environment_class, short_names
 from agentspec.registry import SpecError
 from agentspec.types import Task
 
@@ -37,6 +37,15 @@ def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "t
     if split == "train" and base + count > SPLITS["validation"]:
         raise ValueError(f"training seeds {base}..{base + count - 1} reach the held-out range; use fewer than 10,000")
     return [Task(env, base + i, options, split) for i in range(count)]
+
+
+def episode_key(task: Task) -> str:
+    """The same for tasks that are the same episode: seeds of a finite suite count modulo its number of episodes.
+
+    See `episodes` in `agentspec.envs.contract`.
+    """
+    count = getattr(environment_class(task.env), "episodes", lambda _: None)(task.options)
+    return replace(task, seed=task.seed % count if count else task.seed, split="").key
 
 
 def task_sets(tasks: Tasks) -> dict[str, list[Task]]:

@@ -10,6 +10,7 @@ CUT = " ..."
 
 _PARTS = re.compile(r"\n\s*\n| \| ")
 _LEAST = 8
+_LABEL = 16  # signs of a line beside what it tells: "Last: turned left."
 
 CountTokens = Callable[[str], int]
 
@@ -66,6 +67,22 @@ def clip_text(text: str, budget: int, count_tokens: CountTokens = estimate_token
         else:
             high = middle - 1
     return text[:low].rstrip() + CUT if low else ""
+
+
+def news(text: str, before: str, told: str = "") -> str:
+    """What an observation says that the one before it did not: its lines less those that are unchanged.
+
+    A line is left out too if all it says is what was `told` of the action between them.
+
+    >>> news("Find it.\\nLast: turned left.\\nIn front: a wall.", "Find it.\\nIn front: nothing.", "turned left")
+    'In front: a wall.'
+    """
+    known = {line.strip() for line in before.splitlines() if line.strip()}
+    told = told.strip()
+    lines = [line for line in text.splitlines() if line.strip() not in known]
+    if told:
+        lines = [line for line in lines if not (told in line and len(line.strip()) <= len(told) + _LABEL)]
+    return "\n".join(lines).strip()
 
 
 def excerpt(text: str, budget: int, count_tokens: CountTokens = estimate_tokens) -> str:

@@ -379,7 +379,9 @@ class Experience:
         info = transition.info
         error = str(info.get("error") or "")
         ok = not error and not info.get("invalid") and isinstance(transition.decision.action, Action)
-        feedback = error or str(info.get("message") or "done")
+        action = transition.decision.action
+        why = action.message if isinstance(action, ActionError) else ""
+        feedback = error or str(info.get("message") or why or ("done" if ok else "failed"))
         return cls(transition.step, transition.input.text, transition.action_text, ok, feedback, transition.reward)
 
     def line(self) -> str:

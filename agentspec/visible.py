@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import re
 
+LONGEST = 50_000
+"""Signs of an answer that are read: of a longer one the beginning and the end, half each."""
+
 _BLOCKS = "think|thinking|thoughts?|reasoning|reason|reflection|analysis|scratchpad|inner_monologue|antthinking"
 _BLOCK = re.compile(rf"<(/?)(?:\w+:)?(?:{_BLOCKS})\b[^<>]*>|\[(/?)THINK\]|◁(/?)think▷", re.IGNORECASE)
 _OTHER_BLOCKS = (
     (re.compile(r"<\|begin_of_thought\|>"), re.compile(r"<\|end_of_thought\|>")),
+    (re.compile(r"<\|START_THINKING\|>"), re.compile(r"<\|END_THINKING\|>")),
     (re.compile(r"<\|channel>thought\b"), re.compile(r"<channel\|>")),
 )
 _FINAL = re.compile(r"<\|channel\|>\s*final\s*<\|message\|>")
@@ -20,7 +24,15 @@ _BARE_FINAL = re.compile(r"\Aanalysis(?=[A-Z\W]).*?assistantfinal", re.DOTALL)
 """Harmony channels whose marks a server has dropped."""
 _TOOL = re.compile(r"<\|channel\|>\s*commentary\s+(?=to=)")
 _TOKEN = re.compile(r"<\|[^<>|]{1,40}\|>|</s>|<end_of_turn>|<eos>")
+_ASIDE = re.compile(
+    r"<(plan|planning|notes?|observation|memory|examples?|alternatives|considered|options|summary|internal|context|"
+    r"history|state|steps)>.*?</\1>",
+    re.IGNORECASE | re.DOTALL,
+)
+"""Blocks beside an answer whose actions are not the one that is meant."""
+_STRUCK = re.compile(r"(?<!~)~~(?!~)[^~\n]+~~(?!~)")
 _AS_LABEL = re.compile(r"<(action|answer|final_answer|command)>(.*?)(?:</\1>|$)", re.IGNORECASE | re.DOTALL)
+_LATEX = re.compile(r"\\(?:text|texttt|textbf|textsf|mathrm|mathtt|mathbf)\{([^{}]*)\}")
 _BOXED = re.compile(r"\\boxed\{([^{}]*)\}")
 _QUOTES = str.maketrans(dict.fromkeys("“”„«»「」『』", '"'))
 _OBJECT = re.compile(r'[{,]\s*"\w+"\s*:')
@@ -71,7 +83,14 @@ def undressed(text: str) -> str:
     # Quotes within the strings of JSON are none of its own.
     text = text if _OBJECT.search(text) else text.translate(_QUOTES)
     text = _MINUS.sub("-", text.translate(_SIGNS)).replace("\\_", "_")
-    text = _PRINT.sub(r"\1", text)
-    text = _ROW.sub(lambda m: m[1].replace("|", "\n"), _RULE.sub("", _TAG.sub("", text)))
+    text = _LATEX.sub(r"\1", _STRUCK.sub("", _PRINT.sub(r"\1", _ASIDE.sub("", text) if "</" in text else text)))
+    # The cells of a table are a list: several actions in it leave open which one is meant.
+    text = _ROW.sub(lambda m: "\n".join(f"• {c.strip()}" for c in m[1].split("|")), _RULE.sub("", _TAG.sub("", text)))
     text = _AS_LABEL.sub(lambda m: f"\nAction: {m.group(2).strip()}\n", text)
     return _BOXED.sub(lambda m: f"\nAction: {m.group(1)}\n", text).strip()
+
+
+def bounded(text: str) -> str:
+    """A text that is too long to be read loses its middle."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]}\n{text[-half:]}"

@@ -22,7 +22,8 @@ from typing import Any
 from agentspec.envs.deliverybench.city.citymap import City, load_city
 from agentspec.envs.deliverybench.city.generate import SPLITS, generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
+from agentspec.envs.deliverybench.expert.scripted import luck
 from agentspec.envs.deliverybench.world.orders import OrderBook
 from agentspec.envs.deliverybench.world.rules import FAIR, quirk_table
 
@@ -83,7 +84,7 @@ def row(title: str, members: Sequence[tuple[City, Args]], seeds: int) -> dict[st
     couriers = {
         "rule_based": ("fair", lambda city, seed: RuleBasedCourier(city)),
         "rule_based_original": ("original", lambda city, seed: RuleBasedCourier(city)),
-        "random": ("fair", lambda city, seed: RandomCourier(random.Random(seed))),
+        "random": ("fair", lambda city, seed: luck({}, random.Random(seed))),
     }
     for name, (rules, courier_for) in couriers.items():
         shifts = [

@@ -45,7 +45,7 @@ from benchmarks.memory_cost_table import BASELINE, markdown, paper_ratios
 
 OPTIONS: dict[str, Any] = {"size": "tiny", "city_seed": 0, "shift_hours": 1.0, "observation": "compact"}
 PROBLEMS = tuple(f"memory/problems/{problem}" for problem in ("malformed", "truncated", "overflow", "budget"))
-DEFAULTS: dict[str, Any] = {"steps": 20, "preset": "rl", "model": "smollm2-135m"}
+DEFAULTS: dict[str, Any] = {"steps": 20, "preset": "rl", "model": "smollm2-135m", "dtype": ""}
 TABLE = "memory.md"
 
 
@@ -92,7 +92,7 @@ def observed(spec: AgentSpec) -> tuple[Watched, Observer]:
     return watched, observer
 
 
-def settings_of(name: str, *, steps: int, preset: str, model: str, seed: int = 0) -> dict[str, Any]:
+def settings_of(name: str, *, steps: int, preset: str, model: str, dtype: str = "", seed: int = 0) -> dict[str, Any]:
     """Everything that the figures of a memory depend on: the policy, the agent, the shift."""
     entry = REGISTRY.get("memory", name)
     params = {"preset": preset} if preset in entry.presets else {}
@@ -104,7 +104,7 @@ def settings_of(name: str, *, steps: int, preset: str, model: str, seed: int = 0
         "embedder": ("minilm" if _has_minilm() else "hash") if "embedder" in entry.needs_with(params) else "",
         "sampling": {"max_tokens": 96},
     }
-    return {"model": model, "agent": agent, "seed": seed, "options": OPTIONS, "steps": steps}
+    return {"model": model, "dtype": dtype, "agent": agent, "seed": seed, "options": OPTIONS, "steps": steps}
 
 
 def _has_minilm() -> bool:
@@ -193,10 +193,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=DEFAULTS["steps"], help="of the episode (default: %(default)s)")
     parser.add_argument("--preset", default=DEFAULTS["preset"], help="of methods that have any (default: %(default)s)")
     parser.add_argument("--model", default=DEFAULTS["model"], help="as `run --policy` (default: %(default)s)")
+    parser.add_argument("--dtype", default=DEFAULTS["dtype"], help="of the model's weights, such as bfloat16")
     parser.add_argument("--to", metavar="DIR", type=Path, help=f"one file a method, and {TABLE}, are written there")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args(argv)
-    given = {"steps": arguments.steps, "preset": arguments.preset, "model": arguments.model}
+    given = {name: getattr(arguments, name) for name in DEFAULTS}
     return measure(arguments.methods, given, arguments.to, quiet=arguments.json)
 
 
@@ -212,7 +213,7 @@ def measure(
 
     Args:
         methods: names; empty: all.
-        given: `steps`, `preset` and `model`.
+        given: `steps`, `preset`, `model` and `dtype`.
         folder: of the files; `None`: nothing is written.
         quiet: print one JSON object at the end in place of a line a method.
         llm: the backend; default: that of the policy `model`, built when it is first needed.
@@ -239,7 +240,8 @@ def measure(
         await asyncio.gather(*(one(name, llm) for name in names))
 
     if left := [name for name in settings if name not in known]:
-        llm = llm or Policy.parse(given["model"]).build()
+        backend = {"dtype": given["dtype"]} if given.get("dtype") else {}
+        llm = llm or Policy.parse(given["model"], backend=backend).build()
         assert llm is not None, "a scripted policy asks no memory"
         asyncio.run(together(left, llm))
     rows = {name: rows[name] for name in settings}

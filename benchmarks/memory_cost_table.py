@@ -70,10 +70,11 @@ def markdown(
 ) -> str:
     """The table, what each memory asks, and why ratios lie outside the paper's range."""
     base = rows.get(BASELINE, {})
+    weights = " in ".join(filter(None, (about["model"], about.get("dtype"))))
     lines = [
         "# What memories cost",
         "",
-        f"{about['steps']} steps of DeliveryBench, ReAct, {about['model']}, snapshot layout, preset",
+        f"{about['steps']} steps of DeliveryBench, ReAct, {weights}, snapshot layout, preset",
         f"`{about['preset']}`; per step unless it says otherwise. *paper*: tokens per step relative to ReAct + Base,",
         "median over its backbones (least to most).",
         "",

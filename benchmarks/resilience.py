@@ -196,7 +196,7 @@ def outcome(run: Path) -> tuple[Any, ...]:
     """What must be equal: the adapter bit by bit, every receipt, and the metrics but for times."""
     from safetensors.torch import load_file
 
-    from trainers.runlog import RunLog
+    from agentspec.records.log import RunLog
 
     weights = load_file(run / "adapter_model.safetensors")
     log = RunLog(run)

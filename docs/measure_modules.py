@@ -43,6 +43,7 @@ def measure(method: str, llm: LocalLLM, steps: int) -> str:
         {
             "reasoning": module("reasoning", reasoning),
             "reflection": module("reflection", reflection or "none"),
+            "scope": REGISTRY.get("reflection", reflection or "none").declaration.scope or "episode",
             "layout": "snapshot",
             "sampling": {"max_tokens": MAX_TOKENS},
         }

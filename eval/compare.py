@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from agentspec.records.folder import UPDATES
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Completion, LLMCall, Transition
@@ -76,7 +77,7 @@ def read_side(text: str, task: str = "", *, pictures: bool = True) -> Side:
     same = [t for t in episodes if t.task.key == task]
     trajectory = episodes[int(number)] if number else (same or episodes)[0]
     label = name if place == rest else trajectory.policy or path.stem
-    run = next((folder for folder in path.parents if (folder / "updates.jsonl").is_file()), path.parent)
+    run = next((folder for folder in path.parents if (folder / UPDATES).is_file()), path.parent)
     advantage = advantages_of(run).get(trajectory.episode)
     if isinstance(advantage, list):
         advantage = math.fsum(advantage) / len(advantage) if advantage else None

@@ -27,17 +27,15 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from agentspec.actions import suggest
+from agentspec.extends import read_extended
 from agentspec.llm.pricing import Prices
 from agentspec.parameters import check_types
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
-from agentspec.tasks import SPLITS, parse_seeds
+from agentspec.tasks import SPLITS, episode_key, parse_seeds
 from agentspec.types import Task
-from agentspec.yaml_keys import UniqueLoader
 from eval.cells import Settings
 from eval.limits import Limits
 from eval.matrix import evaluate
@@ -68,22 +66,17 @@ class Matrix:
 
 
 def read_matrix(path: str | Path) -> Matrix:
-    """The matrix of a file; relative paths of adapters, scaffolds and memories are looked up beside it first.
+    """The matrix of a file; it may say `extends: other.yaml` (`agentspec.extends`).
+
+    Relative paths of adapters, scaffolds and memories are looked up beside it first.
 
     Raises:
         SpecError: no such file, or what is wrong in it, by name.
     """
     path = Path(path)
-    if not path.is_file():
-        raise SpecError(f"there is no matrix {path}; give a YAML file with policies, scaffolds and tasks")
-    try:  # a safe loader
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=UniqueLoader)
-    except yaml.YAMLError as error:
-        raise SpecError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-    except SpecError as error:
-        raise SpecError(f"{path}: {error}") from error
+    data = read_extended(path)
     try:
-        return _matrix(_mapping(data, "a matrix"), path.parent)
+        return _matrix(data, path.parent)
     except SpecError as error:
         raise SpecError(f"{path}: {error}") from error
 
@@ -169,7 +162,14 @@ def _tasks(label: str, item: Any) -> list[Task]:
     split = data.get("split", "test")
     if split not in SPLITS:
         raise SpecError(f"tasks {label!r}: unknown split {split!r}; expected one of {', '.join(SPLITS)}")
-    return [Task(data["env"], seed, options, split) for seed in parse_seeds(texts)]
+    tasks = [Task(data["env"], seed, options, split) for seed in parse_seeds(texts)]
+    episodes = len({episode_key(task) for task in tasks})
+    if episodes < len(tasks):
+        raise SpecError(
+            f"tasks {label!r}: {len(tasks)} seeds start {episodes} different episodes (this suite has no more), and "
+            f"one episode played twice is not two tasks: give {episodes} seeds in a row; `rollouts` plays them again"
+        )
+    return tasks
 
 
 def _prices(item: Any, beside: Path) -> Prices:

@@ -1,8 +1,7 @@
 """Failures of a matrix: which kinds, how often, per scaffold and beside the paper's shares.
 
 The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`). How
-far to believe either is for labels to say that a reader gave without seeing them: `read_labels` and `replayed` bring
-such a sample, `agreement` gives precision and recall per kind, `kappa` Cohen's kappa. No sample ships yet.
+far to believe either, a labelled sample says (`eval.labels`).
 """
 
 from __future__ import annotations
@@ -10,15 +9,14 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from agentspec.actions import parse_action
 from agentspec.episode import make_env
 from agentspec.failures import LEAVES, Sign, is_failure, leading, signs
-from agentspec.files import jsonable, read_lines
+from agentspec.files import jsonable
 from agentspec.llm.base import LLM, Message, Request
 from agentspec.perception.generic import GenericPerception
 from agentspec.simulator import OBJECTS_IN_INFO
@@ -170,80 +168,24 @@ def read_kind(text: str) -> str:
     return named[0] if len(named) == 1 else ""
 
 
-# -- how far to believe it -------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Of one kind: how many were labelled so, how many were said to be, and in how many both."""
-
-    labelled: int
-    said: int
-    both: int
-
-    @property
-    def precision(self) -> float | None:
-        """Of those said, the share that is labelled so."""
-        return self.both / self.said if self.said else None
-
-    @property
-    def recall(self) -> float | None:
-        """Of those labelled, the share that is said."""
-        return self.both / self.labelled if self.labelled else None
-
-
-def agreement(labels: Sequence[str], said: Sequence[str]) -> dict[str, Agreement]:
-    """Per kind, and over all kinds under `all` (an open answer is said of none)."""
-    kinds = [leaf for leaf in LEAVES if leaf in {*labels, *said}]
-    found = {
-        leaf: Agreement(
-            sum(label == leaf for label in labels),
-            sum(answer == leaf for answer in said),
-            sum(label == answer == leaf for label, answer in zip(labels, said, strict=True)),
-        )
-        for leaf in kinds
-    }
-    whole = Agreement(len(labels), sum(a.said for a in found.values()), sum(a.both for a in found.values()))
-    return found | {"all": whole}
-
-
-def kappa(a: Sequence[str], b: Sequence[str]) -> float:
-    """Cohen's kappa of two raters: agreement beyond what their own frequencies would give by chance.
-
-    >>> kappa(["x", "x", "y", "y"], ["x", "x", "y", "x"])
-    0.5
-
-    Raises:
-        ValueError: nothing rated, or lists of different lengths.
-    """
-    if not a or len(a) != len(b):
-        raise ValueError(f"expected two ratings of the same items, got {len(a)} and {len(b)}")
-    observed = sum(x == y for x, y in zip(a, b, strict=True)) / len(a)
-    expected = sum(a.count(kind) * b.count(kind) for kind in {*a, *b}) / len(a) ** 2
-    return 1.0 if expected == 1 else (observed - expected) / (1 - expected)
-
-
-def read_labels(path: str | Path) -> list[dict[str, Any]]:
-    """A labelled sample: `{"task": {...}, "actions": [...], "label": leaf, "why": ...}` per line.
-
-    An episode is kept as the texts that were executed; `replayed` plays them again.
-
-    Raises:
-        ValueError: naming file and line of what is no JSON object, or a label that is no kind of failure.
-    """
-    found = read_lines(path)
-    for number, record in enumerate(found, 1):
-        if record.get("label") not in LEAVES:
-            raise ValueError(f"{path}, line {number}: {record.get('label')!r} is none of {', '.join(LEAVES)}")
-    return found
+# -- episodes without an agent ---------------------------------------------------------------------
 
 
 def replayed(task: Task, actions: Sequence[str]) -> Trajectory:
     """The episode in which these texts were executed, one per step, to the end of the texts or of the episode."""
+    texts = iter(actions)
+    return played(task, lambda text, info: next(texts, None))
+
+
+def played(task: Task, act: Callable[[str, Mapping[str, Any]], str | None]) -> Trajectory:
+    """The episode that a function plays without an agent: (observation's text, info) -> next text, `None` to end it."""
     env, perception = make_env(task), GenericPerception()
     observation, info = env.reset(seed=task.seed)
     steps: list[Transition] = []
-    for text in actions:
+    while not (steps and (steps[-1].terminated or steps[-1].truncated)):
+        text = act(str(observation["text"]), info)
+        if text is None:
+            break
         shown = perception.perceive(task, observation, info)
         action = parse_action(text, info["action_schema"])
         observation, reward, terminated, truncated, info = env.step(text)
@@ -255,8 +197,6 @@ def replayed(task: Task, actions: Sequence[str]) -> Trajectory:
                 len(steps), shown, decision, text, float(reward), seen, bool(terminated), bool(truncated), report
             )
         )
-        if terminated or truncated:
-            break
     env.close()
     metrics = {**jsonable(info.get("metrics", {})), "return": sum(t.reward for t in steps), "steps": len(steps)}
     return Trajectory(task, {}, transitions=tuple(steps), metrics=metrics)

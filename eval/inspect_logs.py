@@ -19,6 +19,7 @@ from typing import Any
 
 from agentspec.files import digest, read_lines
 from agentspec.metrics import primary_metric
+from agentspec.records.folder import UPDATES
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import LLMCall, Transition
@@ -103,7 +104,7 @@ def _written(path: Path) -> datetime:
 
 def advantages_of(source: Path) -> Advantages:
     """From the receipts of a training run: what each episode's tokens were trained towards."""
-    path = source / "updates.jsonl"
+    path = source / UPDATES
     if not source.is_dir() or not path.is_file():
         return {}
     found: dict[str, Any] = {}

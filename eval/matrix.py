@@ -98,7 +98,7 @@ def evaluate(
     if executor != "ray" and (workers != 1 or address):
         raise SpecError("workers and address are those of Ray: give executor: ray (--executor ray), or leave them out")
     seen = observer or Observer()
-    kept = Store(store or out)
+    kept = Store(store or out, settings.prices)
     rows_of = [[plan_cell(p, label, spec, sets, settings, kept) for label, spec in specs.items()] for p in policies]
     cells = [cell for row in rows_of for cell in row]
     missing = {cell.name: _missing(cell, kept, settings) for cell in cells}

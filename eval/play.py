@@ -23,6 +23,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from eval.cells import Cell, Planned, Settings
 from eval.naming import slug
+from eval.repricing import usage_of
 from eval.store import Record, Store
 
 MakeLLM = Callable[[Policy], LLM | None]
@@ -31,12 +32,14 @@ Told = Callable[[Cell, Planned, Record], None]
 
 @dataclass(frozen=True)
 class Played:
-    """A finished episode as it travels between processes: its row, what memory it left, how long it took, its JSON."""
+    """A finished episode as it travels between processes: its row, what memory it left, how long it took, its JSON, and
+    what its calls used of which model (`eval.repricing.usage_of`)."""
 
     episode: dict[str, Any]
     state: bytes | None
     wall_s: float
     trajectory: str = ""
+    usage: list[dict[str, Any]] = field(default_factory=list)
 
 
 class Player(Protocol):
@@ -72,7 +75,8 @@ class LocalPlayer:
         except TimeoutError:
             trajectory = _unfinished(cell, job, f"the episode took longer than {most:g} s")
         text = trajectory.to_json() if settings.trajectories else ""
-        return Played(episode_of(trajectory), trajectory.memory_state, time.monotonic() - began, text)
+        used, took = usage_of(trajectory.calls), time.monotonic() - began
+        return Played(episode_of(trajectory), trajectory.memory_state, took, text, used)
 
 
 def _unfinished(cell: Cell, job: Job, why: str) -> Trajectory:
@@ -159,6 +163,7 @@ class Play:
         record: dict[str, Any] = {
             "configuration": cell.configuration,
             "episode": played.episode,
+            "usage": played.usage,
             "wall_s": round(played.wall_s, 3),
         }
         if played.trajectory:

@@ -18,8 +18,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agentspec.files import append_lines, digest, jsonable, parse_line, repair_lines, whole_lines, write_atomic
-from agentspec.registry import SpecError
+from agentspec.files import append_lines, digest, held, jsonable, parse_line, repair_lines, whole_lines, write_atomic
+from agentspec.llm.pricing import Prices
+from eval.repricing import repriced
 
 EPISODES = "episodes.jsonl"
 LOCK = ".lock"
@@ -31,13 +32,14 @@ class Store:
 
     Args:
         folder: where they are kept; made when the first one is added.
+        prices: what episodes cost when they are read; `None`: what they cost when they were played.
 
     Raises:
         ValueError: a line that is no record of an episode, with its number.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | Path, prices: Prices | None = None) -> None:
+        self.folder, self.prices = Path(folder), prices
         self.path = self.folder / EPISODES
         self._records: dict[str, Record] = {}
         self._configurations: dict[str, str] = {}
@@ -62,22 +64,16 @@ class Store:
         Raises:
             SpecError: somebody else is writing.
         """
-        from filelock import FileLock, Timeout
-
-        self.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with FileLock(self.folder / LOCK, timeout=0):
-                repair_lines(self.path)
-                self.read()
-                yield self
-        except Timeout:
-            raise SpecError(
-                f"another evaluation is writing into {self.folder}; wait until it has ended, or choose another folder"
-            ) from None
+        refusal = f"another evaluation is writing into {self.folder}"
+        with held(self.folder / LOCK, refusal, "wait until it has ended, or choose another folder"):
+            repair_lines(self.path)
+            self.read()
+            yield self
 
     def get(self, key: str) -> Record | None:
-        """The episode that counts under `key`."""
-        return self._records.get(key)
+        """The episode that counts under `key`, at the store's prices."""
+        record = self._records.get(key)
+        return record if record is None or self.prices is None else repriced(record, self.prices)
 
     def __len__(self) -> int:
         return len(self._records)

@@ -18,23 +18,18 @@ CONFIGS = Path(__file__).parent / "configs"
 
 
 def train_and_draw(config: Any, **how: Any) -> Any:
-    """Train, and draw the reward curve as `reward_curve.png` in the run's folder (if the config asks for plots).
+    """Train (`trainers.run.train`), and draw the reward curve into the run's folder if the config asks for plots.
 
-    Torch and TRL are imported only here: what is wrong with a configuration has been told by then.
-
-    Args:
-        how: as of `trainers.run.train`.
-
-    Returns:
-        the trainer, when all processes are through.
+    Torch and TRL are imported only here: what is wrong with a configuration has been told by then. The trainer is given
+    back when all processes are through.
     """
     from trainers.run import train
 
     trainer = train(config, **how)
     trainer.accelerator.wait_for_everyone()
     if config.plots and trainer.accelerator.is_main_process:
+        from agentspec.records.folder import METRICS
         from eval.plots import reward_curve
-        from trainers.run_folder import METRICS
 
         reward_curve(trainer.run_log.read(METRICS), trainer.run_log.folder / "reward_curve.png", unit=unit(config))
     return trainer

@@ -15,7 +15,7 @@ from recipes.common import CONFIGS, run_recipe, train_and_draw
 def main() -> None:
     """Train actions and notes, save the adapter, draw the reward curve."""
     from trainers.arguments import parse_config
-    from trainers.memory import as_memory
+    from trainers.presets import as_memory
 
     train_and_draw(as_memory(parse_config(default=CONFIGS / "memory_cpu.yaml")))
 

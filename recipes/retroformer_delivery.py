@@ -10,11 +10,8 @@ changes what a courier does, so a reflector has taught something only where it b
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -38,22 +35,16 @@ def main() -> None:
         evaluate_run(config, Path(config.output_dir))
 
 
-def _unscored(runner: Any, jobs: Any) -> list[Any]:
-    """The jobs' episodes; their returns are read off the metrics, so nothing scores them."""
-    from trainers.credit import ScoredEpisode
-
-    return [ScoredEpisode(trajectory, None) for trajectory in runner.run(jobs)]
-
-
 def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
     """Two trials of every held-out task with each reflector and without one (`CONTROL`): rows, also in `folder`."""
     from agentspec.episode import Job, Runner
-    from agentspec.files import write_atomic
+    from agentspec.files import write_atomic, write_lines
     from agentspec.spec import ModuleSpec
     from agentspec.tasks import make_tasks
+    from eval.lessons import markdown
     from trainers.policy import load_actor_and_reflector
     from trainers.retroformer import ADAPTERS, has_lesson, play_trials
-    from trainers.rollouts import local_llm
+    from trainers.rollouts import collect, local_llm
 
     name, options = config.world
     jobs = [Job(task, 0, config.seed) for task in make_tasks(name, options, config.eval_tasks, split="test")]
@@ -67,7 +58,7 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
         runner = Runner(
             agent, local_llm(model, tokenizer, adapters=ADAPTERS), timeout_s=config.env_timeout_s, policy=label
         )
-        played = play_trials(partial(_unscored, runner), jobs)
+        played = play_trials(partial(collect, runner, rewards=config.reward_set), jobs)
         firsts, lasts = ([episode.trajectory for episode in trials] for trials in played)
         for first, last in zip(firsts, lasts, strict=True):
             returns = [t.metrics["return"] if t.scorable else None for t in (first, last)]
@@ -75,42 +66,11 @@ def evaluate_run(config: Any, folder: Path) -> list[dict[str, Any]]:
             lesson = "".join(written) if has_lesson(last) else ""
             row = {"reflector": label, "task": first.task.key, "seed": first.task.seed, "lesson": lesson}
             rows.append(row | dict(zip(("first_return", "second_return"), returns, strict=True)))
-    write_atomic(folder / "evaluation.jsonl", "".join(json.dumps(row, sort_keys=True) + "\n" for row in rows))
+    write_lines(folder / "evaluation.jsonl", rows)
     table = markdown(rows)
     write_atomic(folder / "evaluation.md", table)
     print(table)
     return rows
-
-
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """Per reflector the mean return of both trials and what the lessons changed; then each less those before it.
-
-    A first trial that was good enough has no second one: it counts with its own return, and a gain of 0. Tasks with a
-    trial that failed to run are left out.
-    """
-    from eval.statistics import mean_interval, paired
-    from eval.tables import show, table
-
-    body, gains = [], {}
-    for label in dict.fromkeys(row["reflector"] for row in rows):
-        members = [r for r in rows if r["reflector"] == label]
-        played = [r for r in members if r["first_return"] is not None and r["second_return"] is not None]
-        gains[label] = {r["task"]: r["second_return"] - r["first_return"] for r in played}
-        returns = [mean_interval([r[key] for r in played]) for key in ("first_return", "second_return")]
-        lessons = sum(bool(r["lesson"]) for r in played)
-        numbers = [show(e, 2) for e in (*returns, mean_interval(list(gains[label].values())))]
-        body.append([label, str(len(played)), str(lessons), *numbers])
-    pairs = [(a, b) for b, a in combinations(gains, 2)]
-    lines = [
-        "# What lessons are worth",
-        "",
-        "Return of the first and of the second trial on held-out tasks, mean over tasks, 95% t interval.",
-        "",
-        *table(["reflector", "tasks", "lessons", "first trial", "second trial", "gain"], body),
-        "",
-        *(f"Paired difference in gain, {a} less {b}: {show(paired(gains[a], gains[b]), 2)}." for a, b in pairs),
-    ]
-    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from recipes.common import CONFIGS, run_recipe, train_and_draw
 def main() -> None:
     """Train with summaries, save the adapter, draw the reward curve."""
     from trainers.arguments import parse_config
-    from trainers.supo import as_supo
+    from trainers.presets import as_supo
 
     train_and_draw(as_supo(parse_config(default=CONFIGS / "supo_cpu.yaml")))
 

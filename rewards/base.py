@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import importlib
 import math
-import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from agentspec.actions import suggest
+from agentspec.importing import look_here
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 
@@ -34,8 +33,7 @@ class RewardEntry:
             SpecError: there is no such module, or no function of that name in it.
         """
         module, _, name = self.target.partition(":")
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())
+        look_here()
         try:
             reward: Reward = getattr(importlib.import_module(module), name)
         except ModuleNotFoundError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from agentspec.envs.shared import come_nearer
 from agentspec.trajectory import Trajectory
 
 
@@ -23,9 +24,8 @@ def goal_progress(trajectory: Trajectory) -> tuple[float, ...]:
 def geodesic_progress(trajectory: Trajectory) -> tuple[float, ...]:
     """Metres that a step came nearer to where the target is seen, on foot, over the shortest path's length.
 
-    Clipped to the metres that the step moved, either way (AllenAct's shaping): a jump of the measured distance is paid
-    as it is walked, and what a clip left out is settled by the steps after it. So no loop earns anything. Paths shorter
-    than a metre count as one. Steps beside the known floor pay 0.
+    Clipped to the metres that the step moved (`agentspec.envs.shared.come_nearer`). Paths shorter than a metre count as
+    one. Steps beside the known floor pay 0.
 
     Raises:
         ValueError: an environment that does not report `info["geodesic"]`.
@@ -36,7 +36,7 @@ def geodesic_progress(trajectory: Trajectory) -> tuple[float, ...]:
     for report in reports:
         after, moved = report["left"], report["walked"] - walked
         level = after if level is None else level
-        nearer = 0.0 if after is None else max(-moved, min(moved, level - after))
+        nearer = 0.0 if after is None else come_nearer(level, after, moved)
         level = level if level is None else level - nearer
         paid.append(nearer / max(report["shortest"], 1.0))
         walked = report["walked"]

@@ -56,7 +56,7 @@ def test_react_grows_one_transcript_with_real_observations() -> None:
     trajectory, seen = play(lambda r: next(answers), {"reasoning": "react"})
     second = "\n".join(m.text for m in seen[1].messages)
     assert "number 0" in second and "Action: WAIT()" in second and trajectory.transitions[1].input.text in second
-    assert "Observation:" in seen[0].sampling.stop
+    assert "\nObservation:" in seen[0].sampling.stop
 
 
 def test_react_hallucinated_observations_are_cut() -> None:

@@ -18,19 +18,20 @@ pytest.importorskip("trl")
 from trl import GRPOConfig
 
 from agentspec.episode import Job, Runner
+from agentspec.extends import merged
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.prompting import static_prompt
 from agentspec.reasoning.react import FORMAT
+from agentspec.records.folder import last_complete_checkpoint
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
 from recipes.common import CONFIGS, run_recipe
 from trainers.ahead import KNOWN, OURS
-from trainers.arguments import merged, parse_config, read_config
+from trainers.arguments import parse_config, read_config
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
 from trainers.run import train
-from trainers.run_folder import last_complete_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 ON_CPU = ["--use_cpu", "true", "--bf16", "false", "--report_to", "none"]

@@ -6,7 +6,7 @@ Names of fields, the agents, the world, rewards, the model's name. `trainers.che
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from agentspec.actions import suggest
@@ -39,8 +39,24 @@ STRUCTURES = (*SPECS, "environment", "rewards")
 """Fields that hold a mapping or a list: on the command line as JSON or YAML."""
 
 
+def check_names(names: Iterable[Any], where: str, *, dashes: str = "") -> None:
+    """Refuse fields that do not exist, and those that nobody reads, whatever their value.
+
+    Args:
+        where: what they were read from, for the message.
+        dashes: before the name of an option.
+    """
+    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
+    for name in map(str, names):
+        if name in why:
+            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
+        if name not in KNOWN:
+            kind, hint = "option" if dashes else "key", suggest(dashes + name, [dashes + known for known in KNOWN])
+            raise SpecError(f"{where}: unknown {kind} {dashes + name!r}{hint}")
+
+
 def check_ahead(data: Mapping[str, Any], options: Sequence[str]) -> None:
-    """Refuse names and options that nobody knows.
+    """Refuse a model, an agent, a world or a reward that there is not.
 
     Args:
         data: fields of the configuration.
@@ -50,10 +66,6 @@ def check_ahead(data: Mapping[str, Any], options: Sequence[str]) -> None:
         SpecError: what was given and what there is.
         ModelNotFoundError: no such model, as far as can be told without asking a hub.
     """
-    for word in options:
-        name = word[2:].partition("=")[0].replace("-", "_")
-        if word.startswith("--") and name.removeprefix("no_") not in (*KNOWN, "help"):
-            raise SpecError(f"unknown option {word!r}{suggest(word, [f'--{known}' for known in KNOWN])}")
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("model", "estimator", "loss_type", *STRUCTURES):
         parser.add_argument(f"--{name}", f"--{name.replace('_', '-')}", dest=name, nargs="*")
@@ -85,11 +97,7 @@ def structure(value: Any) -> Any:
 
 
 def check_world(value: Any) -> tuple[str, dict[str, Any]]:
-    """Name and options of an environment that exists and takes them.
-
-    Raises:
-        SpecError: not of the form `{name: ..., options: {...}}`, an unknown name or option.
-    """
+    """Name and options of an environment that exists and takes them; else a `SpecError`."""
     given: Any = {"name": value} if isinstance(value, str) else value
     if not isinstance(given, Mapping) or not isinstance(given.get("name"), str) or set(given) - {"name", "options"}:
         raise SpecError(f"environment: expected {{name: ..., options: {{...}}}}, got {given!r}")

@@ -1,11 +1,11 @@
 """The audit of a run: every update checked against the episodes it claims to come from.
 
-First that the records are those that were written (`trainers.chain`): no record of any file was edited, deleted, added
-or moved. Then that they say the truth: the receipt of every update is made anew from its episodes and its manifest and
-compared field by field (rows, advantages, distributions, denominator, padding, settings). Beside what the trainer does,
-every trained token was sampled by the policy, there, after exactly that prompt (`trainers.provenance`), advantages of a
-group sum to zero where the estimator says so, and what a write to memory earned is what the episodes played for it say
-(`trainers.counterfactuals`).
+First that the records are those that were written (`agentspec.records.chain`): no record of any file was edited,
+deleted, added or moved. Then that they say the truth: the receipt of every update is made anew from its episodes and
+its manifest and compared field by field (rows, advantages, distributions, denominator, padding, settings). Beside what
+the trainer does, every trained token was sampled by the policy, there, after exactly that prompt
+(`trainers.provenance`), advantages of a group sum to zero where the estimator says so, and what a write to memory
+earned is what the episodes played for it say (`trainers.counterfactuals`).
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from agentspec.records.chain import check_end, files_of, linked_receipts, manifest_of, read_manifests, read_round
+from agentspec.records.completions import check_completions
+from agentspec.records.folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers.chain import check_end, files_of, linked_receipts, manifest_of, read_manifests, read_round
 from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import attach
 from trainers.credit import CreditRule
 from trainers.estimators import estimator
 from trainers.losses import UpdateSize, loss
-from trainers.provenance import check_completion, check_tokens
+from trainers.provenance import check_tokens
 from trainers.receipts import receipt_record, receipt_rows, settings
-from trainers.run_folder import MANIFEST, TRAJECTORIES, UPDATES, holds_run
 from trainers.sequences import Row
 
 TOLERANCE, SMALLEST = 1e-9, 1e-12
@@ -231,7 +232,5 @@ def check_samples(rows: Sequence[Row], episodes: Sequence[Trajectory], problems:
         problems += found
         by_tag += counted
     for t in episodes:
-        for call in t.calls:
-            for completion in call.completions:
-                problems += check_completion(completion, f"call {call.id} of {t.episode}")
+        problems += check_completions(t)
     return by_tag

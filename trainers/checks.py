@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
 from agentspec.actions import suggest
@@ -16,10 +16,10 @@ from agentspec.llm.batching import Batching
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import MODULE_KINDS, AgentSpec
+from agentspec.tags import matches
+from agentspec.tasks import episode_key, make_tasks
 from trainers.estimators import ESTIMATORS
-from trainers.fields import REFUSED
 from trainers.losses import LOSSES, loss
-from trainers.sequences import TrainFilter, unmatched_patterns
 from trainers.unread import REFLECTION, unread_with_a_value
 from trainers.writes import write_credit
 
@@ -55,30 +55,13 @@ RANGES: dict[tuple[float, float], str] = {
 
 
 def check(config: ScaffoldConfig) -> None:
-    """Refuse what cannot work, would not be exact, or would change nothing.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what cannot work, would not be exact, or would change nothing."""
     _ = config.reward_set, config.world, config.other_specs, config.starting_memory, config.evaluation_specs
     AgentSpec.from_data({"sampling": config.evaluation_sampling})
     check_reporters(config)
     for found in (_values, unread_with_a_value, _calls, _writes, _rounds, _vllm):
         for problem in found(config):
             raise SpecError(problem)
-
-
-def check_given(names: Iterable[str], where: str) -> None:
-    """Refuse fields that a user names and nobody reads, whatever their value.
-
-    Args:
-        names: keys of a YAML file, or options of a command line.
-        where: what they were read from, for the message.
-    """
-    why = {name: reason for reason, listed in REFUSED.items() for name in listed.split()}
-    for name in names:
-        if name in why:
-            raise SpecError(f"{where}: `{name}` is not read: {why[name]}")
 
 
 def check_reporters(config: Any) -> None:
@@ -110,7 +93,7 @@ def _calls(config: ScaffoldConfig) -> Iterator[str]:
         if not getattr(config, name):
             yield f"{name} is empty, so nothing would be trained; name some, or leave the field out"
     for name, patterns in (("train_calls", config.train_calls), ("mask_truncated", config.mask_truncated)):
-        if missing := unmatched_patterns(paths, TrainFilter(tuple(patterns))):
+        if missing := [p for p in patterns if not any(matches(path, p) for path in paths)]:
             there = ", ".join(sorted(set(paths))) or "none (no module calls the model)"
             yield f"{name} {missing} match no call of this scaffold, so they would change nothing; its calls: {there}"
     temperatures = {"sampling.temperature": spec.sampling.temperature}
@@ -154,8 +137,8 @@ def _writes(config: ScaffoldConfig) -> Iterator[str]:
             f"write_credit {spec.name!r} with roles {list(roles)}: an episode is played again from its recorded "
             "answers, and those of helper models are not given back; use `write_credit: ablation`, or no helper"
         )
-    paths, writes = own_memory_paths(config), TrainFilter(tuple(config.write_calls))
-    if not any(config.train_filter.matches(p) and writes.matches(p) for p in paths):
+    paths = own_memory_paths(config)
+    if not any(config.train_filter.matches(p) and matches(p, config.write_calls) for p in paths):
         yield (
             f"write_credit {spec.name!r}, but no call of memory {config.spec.memory.name!r} is both trained "
             f"(train_calls {config.train_calls}) and a write (write_calls {config.write_calls}); its calls are "
@@ -212,11 +195,7 @@ def _vllm(config: ScaffoldConfig) -> Iterator[str]:
 
 
 def check_retroformer(config: ScaffoldConfig) -> None:
-    """Refuse what does not train a reflector beside a frozen actor.
-
-    Raises:
-        SpecError: what was given, why it cannot work, what to do.
-    """
+    """Refuse (`SpecError`) what does not train a reflector beside a frozen actor."""
     for problem in _retroformer(config):
         raise SpecError(problem)
 
@@ -273,3 +252,14 @@ def notes(config: ScaffoldConfig) -> Iterator[str]:
         )
     if config.top_entropy_quantile < 1:
         yield "top_entropy_quantile: the quantile is of each micro-batch, so it depends on how rows are split"
+    yield from _seen(config)
+
+
+def _seen(config: ScaffoldConfig) -> Iterator[str]:
+    """Held-out tasks that are training tasks all the same, in suites of few episodes."""
+    trained = {episode_key(task) for task in make_tasks(*config.world, config.train_tasks)}
+    validated = config.validation_tasks if config.validates else 0
+    for split, count in (("validation", validated), ("test", config.eval_tasks)):
+        tasks = make_tasks(*config.world, count, split=split)
+        if seen := sum(episode_key(task) in trained for task in tasks):
+            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: there are no others"

@@ -172,11 +172,7 @@ class ScaffoldConfig(GRPOConfig):
 
     @property
     def world(self) -> tuple[str, dict[str, Any]]:
-        """Name and options of the environment.
-
-        Raises:
-            SpecError: not of the form `{name: ..., options: {...}}`, an unknown name or option.
-        """
+        """Name and options of the environment; `SpecError` where there is no such."""
         return check_world(self.environment or "deliverybench")
 
     @property

@@ -1,11 +1,9 @@
 """Episodes beside the batch that say what a write to memory was worth: played, recorded, told apart.
 
-A re-roll begins in exactly the state in which the write was asked for. That state is reached by playing the episode
-again: every answer before the write is the recorded one, and an episode repeats (`agentspec.episode`), so that the
-environment, the memory, the conversation and the reasoner are what they were, whether or not they can be restored
-from a snapshot. The write itself is then either the recorded answer, or withheld: the module is told that no answer
-came, and does what it does then. From there on the policy samples anew; re-rolls of one number sample with the same
-seeds with and without the write, so that a write which no prompt shows earns exactly nothing.
+A re-roll begins in exactly the state in which the write was asked for: the episode is played again with its recorded
+answers (`agentspec.llm.replayed`). The write itself is then either the recorded one, or withheld: the module is told
+that no answer came, and does what it does then. From there on the policy samples anew; re-rolls of one number sample
+with the same seeds with and without the write, so that a write which no prompt shows earns exactly nothing.
 
 Records carry their plan in their metrics (`counterfactual/...`) and lie in the run's folder `counterfactuals`.
 """
@@ -13,14 +11,14 @@ Records carry their plan in their metrics (`counterfactual/...`) and lie in the 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
 
 from agentspec.episode import Job, Runner
-from agentspec.llm.base import LLM, ContextOverflowError, LLMError, Message, Request
 from agentspec.llm.none import NoLLM
 from agentspec.llm.recorder import derive_seed
+from agentspec.llm.replayed import ReplayedLLM, key_of
 from agentspec.spec import ModuleSpec
 from agentspec.trajectory import Trajectory
 from agentspec.types import LLMCall
@@ -30,83 +28,6 @@ from trainers.writes import EVERY, Plan
 
 FOLDER = "counterfactuals"
 """Folder of a run that holds them, one file per generation round."""
-
-STEP, KEPT, NUMBER = (f"counterfactual/{name}" for name in ("step", "kept", "number"))
-
-Key = tuple[int, str, str]
-"""Step, path and branch of a call; several of one key are told apart by their order."""
-
-
-class WithheldError(ContextOverflowError):
-    """The answer is withheld; a module treats it as a prompt that does not fit: a counted no-op."""
-
-
-@dataclass
-class Replayed:
-    """A backend that gives the recorded answers up to the write of `plan`, then it or nothing, then those of `llm`.
-
-    Args:
-        is_write: path of a call -> whether it writes.
-    """
-
-    llm: LLM
-    recorded: Trajectory
-    plan: Plan
-    is_write: Callable[[str], bool]
-    _given: dict[Key, list[LLMCall]] = field(default_factory=lambda: defaultdict(list), repr=False)
-    _asked: Counter[Key] = field(default_factory=Counter, repr=False)
-
-    def __post_init__(self) -> None:
-        self.name = self.llm.name
-        self.capabilities = self.llm.capabilities
-        self.max_context = self.llm.max_context
-        for call in prefix(self.recorded, self.plan, self.is_write):
-            self._given[_key(call)].append(call)
-
-    async def generate(self, request: Request) -> LLMCall:
-        """The recorded answer, the live one, or none.
-
-        Raises:
-            WithheldError: it is the write, and it is withheld.
-        """
-        key = _key(request)
-        number = self._asked[key]
-        self._asked[key] += 1
-        if number < len(self._given[key]):
-            return replace(self._given[key][number], id=request.id)
-        if request.tag.step == self.plan.step and self.is_write(request.tag.path) and not self.plan.kept:
-            raise WithheldError(f"{request.tag.path} of step {request.tag.step} is withheld")
-        if request.tag.step < self.plan.step:
-            raise LLMError(f"{request.tag.path} of step {request.tag.step} was not asked when the episode was recorded")
-        seed = derive_seed(self.recorded.seed, "reroll", self.plan.number, *key, number)
-        live = replace(request, seed=seed, tag=replace(request.tag, episode=self._name(request.tag.episode)))
-        return replace(await self.llm.generate(live), tag=request.tag)
-
-    async def score(
-        self, messages: Sequence[Message], continuations: Sequence[str], *, episode: str = ""
-    ) -> tuple[float, ...]:
-        """As the live model scores."""
-        return await self.llm.score(messages, continuations, episode=self._name(episode))
-
-    def count_tokens(self, text: str) -> int:
-        """As the live model counts."""
-        return self.llm.count_tokens(text)
-
-    def enter(self, episode: str) -> None:
-        """Goes live under a name of its own: the episode's other re-rolls play beside it."""
-        self.llm.enter(self._name(episode))
-
-    def leave(self, episode: str) -> None:
-        """Its own name ends."""
-        self.llm.leave(self._name(episode))
-
-    def _name(self, episode: str) -> str:
-        plan = self.plan
-        return f"{episode}~{plan.step}{'with' if plan.kept else 'without'}{plan.number}" if episode else ""
-
-
-def _key(of: LLMCall | Request) -> Key:
-    return of.tag.step, of.tag.path, of.tag.branch
 
 
 def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) -> list[LLMCall]:
@@ -120,20 +41,13 @@ def prefix(trajectory: Trajectory, plan: Plan, is_write: Callable[[str], bool]) 
 def play_beside(
     runner: Runner, jobs: Sequence[Job], episodes: Sequence[ScoredEpisode], rule: CreditRule, *, retries: int = 0
 ) -> list[ScoredEpisode]:
-    """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants.
-
-    Args:
-        retries: as of `trainers.rollouts.collect`: a repeated episode had another seed.
-    """
+    """The episodes (of `jobs`, in order, as `runner` played them) with the counterfactuals that the rule wants."""
     wanted = [
-        (i, plan, _job(job, episode.trajectory, retries))
-        for i, (job, episode) in enumerate(zip(jobs, episodes, strict=True))
-        for plan in rule.writes.plan(episode.trajectory, rule.train)
+        (e.trajectory, plan, _job(job, e.trajectory, retries))
+        for job, e in zip(jobs, episodes, strict=True)
+        for plan in rule.writes.plan(e.trajectory, rule.train)
     ]
-    if not wanted:
-        return list(episodes)
-    played = asyncio.run(_play_all(runner, [(episodes[i].trajectory, p, j) for i, p, j in wanted], rule))
-    return attach(episodes, played, rule)
+    return attach(episodes, asyncio.run(_play_all(runner, wanted, rule)), rule) if wanted else list(episodes)
 
 
 def _job(job: Job, trajectory: Trajectory, retries: int) -> Job:
@@ -151,7 +65,7 @@ async def _play_all(
     async def play(recorded: Trajectory, plan: Plan, job: Job) -> Trajectory:
         async with gate:
             [trajectory] = await _runner(runner, recorded, plan, rule).run_async([job])
-        return settled(mark(trajectory, plan), recorded, plan, rule)
+        return settled(trajectory, recorded, plan, rule)
 
     return list(await asyncio.gather(*(play(*one) for one in wanted)))
 
@@ -161,17 +75,26 @@ def _runner(runner: Runner, recorded: Trajectory, plan: Plan, rule: CreditRule) 
     quiet = replace(runner, progress=None, on_done=None, on_step=None)
     if plan.step == EVERY:
         return replace(quiet, spec=replace(runner.spec, memory=ModuleSpec("none")))
-    return replace(quiet, llm=Replayed(runner.llm or NoLLM(), recorded, plan, rule.writes.is_write))
+    is_write = rule.writes.is_write
+    replayed = ReplayedLLM(
+        runner.llm or NoLLM(),
+        prefix(recorded, plan, is_write),
+        step=plan.step,
+        withheld=lambda r: not plan.kept and r.tag.step == plan.step and is_write(r.tag.path),
+        seeds=(recorded.seed, "reroll", plan.number),
+        suffix=f"~{plan.step}{'with' if plan.kept else 'without'}{plan.number}",
+    )
+    return replace(quiet, llm=replayed)
 
 
-def mark(trajectory: Trajectory, plan: Plan) -> Trajectory:
-    """The record, with its plan."""
-    marks = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
-    return replace(trajectory, metrics={**trajectory.metrics, **marks})
+def marks(plan: Plan) -> dict[str, int]:
+    """What the metrics of a record say of its plan."""
+    return {f"counterfactual/{name}": value for name, value in asdict(plan).items()}
 
 
 def settled(trajectory: Trajectory, episode: Trajectory, plan: Plan, rule: CreditRule) -> Trajectory:
-    """The record; failed if it is not what was planned (a module that does not repeat), or earned what is no number."""
+    """The record with its plan; failed if it is another thing (a module that does not repeat), or earned no number."""
+    trajectory = replace(trajectory, metrics={**trajectory.metrics, **marks(plan)})
     problems = list(differences(episode, trajectory, plan, rule))
     try:
         rule.score([trajectory])
@@ -218,12 +141,11 @@ def attach(
 def differences(episode: Trajectory, other: Trajectory, plan: Plan, rule: CreditRule) -> Iterator[str]:
     """What makes a record another thing than the counterfactual of `plan` of this episode (nothing: it is that)."""
     where = f"counterfactual of step {plan.step} of {episode.episode}"
-    marks: Mapping[str, object] = {STEP: plan.step, KEPT: plan.kept, NUMBER: plan.number}
     if (other.task, other.rollout, other.seed) != (episode.task, episode.rollout, episode.seed):
         yield f"{where}: it is of {other.episode}"
     if other.policy != episode.policy:
         yield f"{where}: it was played by policy {other.policy}"
-    if any(other.metrics.get(name) != value for name, value in marks.items()):
+    if any(other.metrics.get(name) != value for name, value in marks(plan).items()):
         yield f"{where}: its plan is not {plan}"
     if plan.step == EVERY and any(c.tag.module.startswith("memory.") for c in other.calls):
         yield f"{where}: it has calls of memory"
@@ -244,15 +166,15 @@ def _before(trajectory: Trajectory, step: int) -> list[tuple[object, ...]]:
 
 
 def _sampled(calls: Sequence[LLMCall]) -> list[tuple[object, ...]]:
-    return sorted((*_key(c), c.prompt_ids, tuple((x.token_ids, x.logprobs) for x in c.completions)) for c in calls)
+    return sorted((*key_of(c), c.prompt_ids, tuple((x.token_ids, x.logprobs) for x in c.completions)) for c in calls)
 
 
 def _first(other: Trajectory, episode: Trajectory, plan: Plan, rule: CreditRule) -> list[LLMCall]:
     """As many of a re-roll's calls as the episode's beginning has, key by key."""
-    left = Counter(_key(c) for c in prefix(episode, plan, rule.writes.is_write))
+    left = Counter(key_of(c) for c in prefix(episode, plan, rule.writes.is_write))
     found = []
     for call in sorted(other.calls, key=lambda c: c.id):
-        if left[_key(call)] > 0:
-            left[_key(call)] -= 1
+        if left[key_of(call)] > 0:
+            left[key_of(call)] -= 1
             found.append(call)
     return found

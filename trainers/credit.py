@@ -101,11 +101,7 @@ class CreditRule:
 
     @classmethod
     def from_manifest(cls, config: Mapping[str, Any]) -> CreditRule:
-        """The rule of a run, from the fields of its configuration (in its manifest, say).
-
-        Raises:
-            ValueError: the record lacks a field that credit depends on.
-        """
+        """The rule of a run, from the fields of its configuration (in its manifest, say)."""
         if missing := [name for name in FIELDS if name not in config]:
             raise ValueError(f"the recorded configuration lacks {', '.join(missing)}, which credit depends on")
         given: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in config.items()}
@@ -136,14 +132,7 @@ class CreditRule:
         )
 
     def advantages(self, outcomes: Sequence[Outcome]) -> list[float | list[float] | None]:
-        """Per rollout its advantage, or one per step; `None` for a rollout that counts nowhere.
-
-        Args:
-            outcomes: whole groups, one after the other.
-
-        Raises:
-            ValueError: no whole groups.
-        """
+        """Per rollout of whole groups its advantage, or one per step; `None` for a rollout that counts nowhere."""
         if len(outcomes) % self.group:
             raise ValueError(f"{len(outcomes)} episodes are no whole groups of {self.group}")
         spec = estimator(self.estimator)

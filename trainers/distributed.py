@@ -22,16 +22,11 @@ from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import LLMCall
 from trainers.config import ScaffoldConfig
-from trainers.mixin import Base
 from trainers.sequences import TrainFilter, trained_completions
 
 
 def check_layout(accelerator: Any, config: ScaffoldConfig) -> None:
-    """Refuse a parallel layout that this configuration would hang in.
-
-    Raises:
-        SpecError: what cannot work under sharded weights, why, and what to set.
-    """
+    """Refuse (`SpecError`) a parallel layout that this configuration would hang in."""
     layout = DistributedBackend(accelerator)
     if not layout.is_fsdp and not layout.is_zero3:
         return
@@ -69,15 +64,6 @@ def keep_precision(accelerator: Any) -> None:
     policy = getattr(plugin, "mixed_precision_policy", None)
     if plugin is not None and policy is not None:
         plugin.mixed_precision_policy = replace(policy, output_dtype=None, cast_forward_inputs=False)
-
-
-class KnownLayout(Base):
-    """Checks the parallel layout before a trainer builds anything on it; mixed into the trainer."""
-
-    def create_accelerator_and_postprocess(self) -> None:
-        super().create_accelerator_and_postprocess()
-        check_layout(self.accelerator, self.args)
-        keep_precision(self.accelerator)
 
 
 def check_trained(episodes: Sequence[Trajectory], train: TrainFilter, gather: Callable[[list[Any]], list[Any]]) -> None:

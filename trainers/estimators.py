@@ -53,12 +53,15 @@ def grpo(returns: Returns) -> list[float]:
     >>> [round(a, 3) for a in grpo([15.0, 10.0, 5.0, 15.0])]
     [0.783, -0.261, -1.306, 0.783]
     """
-    return _scaled([_centred(returns)])[0]
+    return _scaled([centred(returns)])[0]
 
 
 def centred(returns: Returns) -> list[float]:
-    """Centred by the group's mean only (Dr. GRPO, Liu et al., 2025): no division by the deviation."""
-    return _centred(returns)
+    """Less the group's mean (Dr. GRPO, Liu et al., 2025); exactly 0 where all are equal up to float noise."""
+    if _deviation(returns) <= TOLERANCE:
+        return [0.0] * len(returns)
+    mean = math.fsum(returns) / len(returns)
+    return [v - mean for v in returns]
 
 
 def rloo(returns: Returns) -> list[float]:
@@ -68,7 +71,7 @@ def rloo(returns: Returns) -> list[float]:
     [1.0, -1.0]
     """
     n = len(returns)
-    return [value * n / (n - 1) for value in _centred(returns)] if n > 1 else [0.0] * n
+    return [value * n / (n - 1) for value in centred(returns)] if n > 1 else [0.0] * n
 
 
 def max_rl(returns: Returns) -> list[float]:
@@ -86,7 +89,7 @@ def max_rl(returns: Returns) -> list[float]:
             "rewards that are never negative, or another estimator"
         )
     mean = math.fsum(returns) / len(returns) if returns else 0.0
-    return [value / mean for value in _centred(returns)] if mean > 0 else [0.0] * len(returns)
+    return [value / mean for value in centred(returns)] if mean > 0 else [0.0] * len(returns)
 
 
 def discounted(rewards: Sequence[float], gamma: float) -> list[float]:
@@ -163,29 +166,17 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
 
 
 def estimator(name: str) -> EstimatorSpec:
-    """The row of `name`.
-
-    Raises:
-        SpecError: no such estimator.
-    """
+    """The row of `name`; `SpecError` with the nearest names if there is none."""
     if name not in ESTIMATORS:
         raise SpecError(f"unknown estimator {name!r}{suggest(name, ESTIMATORS)}")
     return ESTIMATORS[name]
 
 
-def _centred(values: Sequence[float]) -> list[float]:
-    """Less their mean; exactly 0 where all are equal up to float noise."""
-    if _deviation(values) <= TOLERANCE:
-        return [0.0] * len(values)
-    mean = math.fsum(values) / len(values)
-    return [v - mean for v in values]
-
-
-def _scaled(centred: Sequence[Sequence[float]]) -> list[list[float]]:
+def _scaled(values: Sequence[Sequence[float]]) -> list[list[float]]:
     """Divided by the sample deviation of all values; exactly 0 where all are equal up to float noise."""
-    deviation = _deviation([v for values in centred for v in values])
+    deviation = _deviation([v for several in values for v in several])
     divisor = deviation + EPSILON if deviation > TOLERANCE else math.inf
-    return [[v / divisor for v in values] for values in centred]
+    return [[v / divisor for v in several] for several in values]
 
 
 def _deviation(values: Sequence[float]) -> float:

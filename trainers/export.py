@@ -19,14 +19,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from agentspec.files import digest, file_digest, write_atomic
+from agentspec.files import file_digest, read_lines, write_atomic
 from agentspec.llm.models import ModelNotFoundError, ModelSource, resolve
+from agentspec.records.folder import MANIFEST as RUN_MANIFEST
+from agentspec.records.folder import METRICS, checkpoints, digest_of
 from agentspec.registry import SpecError
 from agentspec.trajectory import versions
 from trainers.card import FILE, model_card
-from trainers.run_folder import MANIFEST as RUN_MANIFEST
-from trainers.run_folder import METRICS, checkpoints
-from trainers.runlog import RunLog
 
 MANIFEST = "agentspec.json"
 FORMAT = 1
@@ -34,14 +33,8 @@ FORMAT = 1
 ADAPTER, ADAPTER_CONFIG = "adapter_model.safetensors", "adapter_config.json"
 MODEL_FILES = ("config.json", "generation_config.json", "model.safetensors.index.json", "model*.safetensors")
 TOKENIZER_FILES = (
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "special_tokens_map.json",
-    "added_tokens.json",
-    "chat_template.jinja",
-    "vocab.json",
-    "merges.txt",
-    "tokenizer.model",
+    "tokenizer.json tokenizer_config.json special_tokens_map.json added_tokens.json chat_template.jinja vocab.json "
+    "merges.txt tokenizer.model"
 )
 
 
@@ -54,20 +47,17 @@ class Trained:
 
 
 def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
-    """Write the trained policy of `run` to `to`, whole or not at all.
+    """Write the trained policy of `run` to `to`, which is given back, whole or not at all.
 
     Args:
-        run: output folder of training: its final model, else its last complete checkpoint.
-        to: folder to write; must not exist, or be empty.
-        merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
-            `transformers` reads the result. A run that trained all weights is a whole model either way.
-
-    Returns:
-        `to`.
+    run: output folder of training: its final model, else its last complete checkpoint.
+    to: folder to write; must not exist, or be empty.
+    merge: merge an adapter into its base model's weights (in the base model's dtype), so that any loader of
+        `transformers` reads the result. A run that trained all weights is a whole model either way.
 
     Raises:
-        SpecError: there are no weights in `run`, or `to` holds something.
-        ModelNotFoundError: the base model that an adapter needs cannot be found.
+    SpecError: there are no weights in `run`, or `to` holds something.
+    ModelNotFoundError: the base model that an adapter needs cannot be found.
     """
     run, to = Path(run), Path(to)
     trained = find_trained(run)
@@ -103,11 +93,7 @@ def export(run: str | Path, to: str | Path, merge: bool = False) -> Path:
 
 
 def find_trained(run: Path) -> Trained:
-    """The final weights of a run, or those of its last complete checkpoint.
-
-    Raises:
-        SpecError: there is no such folder, or no safetensors weights in it.
-    """
+    """The final weights of a run, or those of its last complete checkpoint; `SpecError` without either."""
     if not run.is_dir():
         raise SpecError(f"no run folder {run}; give the output_dir of a training run")
     for folder in (run, *reversed(checkpoints(run))):
@@ -172,7 +158,7 @@ def _name_base(config: Path, base: ModelSource) -> None:
 
 def _tokenizer(folder: Path, base: ModelSource | None, to: Path) -> None:
     """The run's tokenizer; the base model's where the run has none."""
-    if _copy(folder, to, TOKENIZER_FILES) or base is None:
+    if _copy(folder, to, TOKENIZER_FILES.split()) or base is None:
         return
     from transformers import AutoTokenizer
 
@@ -190,7 +176,7 @@ def _copy(source: Path, to: Path, patterns: Iterable[str]) -> int:
 def _manifest(
     run: Path, recorded: Mapping[str, Any], trained: Trained, base: ModelSource | None, work: Path, *, merged: bool
 ) -> dict[str, Any]:
-    config, tokenizer = recorded["config"], work / "tokenizer.json"
+    config = recorded["config"]
     more = {name: metadata.version(name) for name in ("peft", "safetensors", "trl")}
     return {
         "format": FORMAT,
@@ -203,10 +189,10 @@ def _manifest(
         },
         "scaffold": recorded.get("spec") or config.get("agent"),
         "environment": config.get("environment"),
-        "template_sha256": _template_sha256(work),
-        "tokenizer_sha256": file_digest(tokenizer) if tokenizer.is_file() else "",
+        "template_sha256": digest_of(work / "chat_template.jinja"),
+        "tokenizer_sha256": digest_of(work / "tokenizer.json"),
         "versions": {"export": versions() | more, "training": recorded.get("versions", {})},
-        "rewards": reward_summary(RunLog(run).read(METRICS)),
+        "rewards": reward_summary(read_lines(run / METRICS)),
     }
 
 
@@ -240,15 +226,3 @@ def _revision(base: ModelSource | None) -> str:
     from transformers import AutoConfig
 
     return str(getattr(AutoConfig.from_pretrained(base.path), "_commit_hash", None) or "")
-
-
-def _template_sha256(folder: Path) -> str:
-    """Digest of the chat template, wherever this version of the library keeps it; empty without one."""
-    file, config = folder / "chat_template.jinja", folder / "tokenizer_config.json"
-    template: Any = ""
-    if file.is_file():
-        template = file.read_text(encoding="utf-8")
-    elif config.is_file():
-        template = json.loads(config.read_text(encoding="utf-8")).get("chat_template")
-    text = template if isinstance(template, str) else json.dumps(template, sort_keys=True)
-    return digest(text) if template else ""

@@ -121,11 +121,7 @@ def defaults(config: type) -> dict[str, Any]:
 
 
 def field_rules(config: type) -> dict[str, FieldRule]:
-    """The rule of every field in the table, by name.
-
-    Args:
-        config: the dataclass whose defaults stand in refused fields (`trl.GRPOConfig`).
-    """
+    """The rule of every field in the table, by name; `config` is the dataclass with their defaults."""
     default = defaults(config)
     rules = {name: FieldRule("used", heading) for heading, names in USED.items() for name in names.split()}
     rules |= {name: FieldRule("fixed", why, allowed) for name, (why, allowed) in FIXED.items()}

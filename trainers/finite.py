@@ -31,15 +31,11 @@ class FiniteGuard(TrainerCallback):
 
 
 def require_finite(what: str, named: Iterable[tuple[str, torch.Tensor]], step: int) -> None:
-    """Refuse a tensor that is not finite.
+    """Refuse (`NonFiniteError`) a tensor that is not finite: which it is, and of which update.
 
     Args:
-        what: what the tensors are.
-        named: their names, and of sharded ones this process's part.
-        step: number of updates made before.
-
-    Raises:
-        NonFiniteError: which tensor, in which update, and what to look at.
+    named: names and tensors; of sharded ones this process's part.
+    step: number of updates made before.
     """
     local = {n: t.to_local() if hasattr(t, "to_local") else t for n, t in named}
     tensors = {n: t.abs().max().isfinite() for n, t in local.items() if t.numel()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -31,13 +31,6 @@ Recorded = Callable[[Sequence[int]], torch.Tensor | None]
 """Tokens -> what came out of the frozen layers when the rollouts read them, (n, hidden), if that is known."""
 FROZEN_TOKENS = 8192
 """Tokens whose frozen output is computed in one forward of a tree, where no other budget is set."""
-
-
-class Packed(NamedTuple):
-    """Token lists as the inputs of one forward, shape (B, L), and where in it, flattened, the tokens of each are."""
-
-    inputs: dict[str, Any]
-    places: Sequence[Sequence[int]]
 
 
 def rows_logprobs(
@@ -152,23 +145,23 @@ def _forward(
     frozen: FrozenOutput | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Log-probability and entropy of every place, from one forward."""
-    packed = _packed(packing, _read(sequences, places), device)
-    count, length = packed.inputs["input_ids"].shape
-    before = torch.tensor([packed.places[r][p - 1] for r, p in places], device=device)
+    inputs, packed = _packed(packing, _read(sequences, places), device)
+    count, length = inputs["input_ids"].shape
+    before = torch.tensor([packed[r][p - 1] for r, p in places], device=device)
     wanted = Wanted(
         before,
         torch.tensor([sequences[r].tokens[p] for r, p in places], device=device),
         torch.tensor([sequences[r].temperatures[p] for r, p in places], device=device),
         tuple(sequences[r].allowed.get(p) for r, p in places),
     )
-    started = frozen.given(sequences, packed.places, (count, length)) if frozen else nullcontext()
+    started = frozen.given(sequences, packed, (count, length)) if frozen else nullcontext()
     with merged_lora(model), started:
         if packing == "tree":
-            output = model(**packed.inputs, wanted=wanted)
+            output = model(**inputs, wanted=wanted)
             return output.log_probs, output.entropies
         # Only positions that some row trains are projected on the vocabulary.
         keep, column = (before % length).unique(return_inverse=True)
-        logits = model(**packed.inputs, logits_to_keep=keep, use_cache=False).logits[before // length, column]
+        logits = model(**inputs, logits_to_keep=keep, use_cache=False).logits[before // length, column]
     return sampled_logprobs(logits, wanted.tokens, wanted.temperatures, wanted.allowed)
 
 
@@ -180,16 +173,18 @@ def _read(sequences: Sequence[TokenSequence], places: Places) -> list[list[int]]
     return [s.tokens[:end] for s, end in zip(sequences, ends, strict=True)]
 
 
-def _packed(packing: Packing, tokens: Sequence[list[int]], device: torch.device) -> Packed:
-    """The inputs of one forward of all token lists: a prefix tree, or rows padded right."""
+def _packed(
+    packing: Packing, tokens: Sequence[list[int]], device: torch.device
+) -> tuple[dict[str, Any], Sequence[Sequence[int]]]:
+    """Inputs (B, L) of one forward, a prefix tree or rows padded right; where, flattened, each list's tokens are."""
     if packing == "tree":
         tree = build_tree(tokens)
-        return Packed(packed_inputs(tree, device), tree.places)
+        return packed_inputs(tree, device), tree.places
     length = max(map(len, tokens))
     ids = torch.tensor([[*t, *[0] * (length - len(t))] for t in tokens], device=device)
     mask = torch.tensor([[1] * len(t) + [0] * (length - len(t)) for t in tokens], device=device)
     places = [range(i * length, i * length + len(t)) for i, t in enumerate(tokens)]
-    return Packed({"input_ids": ids, "attention_mask": mask}, places)
+    return {"input_ids": ids, "attention_mask": mask}, places
 
 
 def frozen_output(
@@ -227,9 +222,9 @@ def frozen_output(
             states[tree.places[i]] = known
     budget = tokens_per_forward or (FROZEN_TOKENS if packing == "tree" else 0)
     for chunk in _chunks(rows, missing, packing, budget):
-        packed = _packed(packing, [tokens[i] for i in chunk], weights.device)
-        found = output_of(decoder, layers, **packed.inputs).flatten(0, 1)
-        for i, here in zip(chunk, packed.places, strict=True):
+        inputs, packed = _packed(packing, [tokens[i] for i in chunk], weights.device)
+        found = output_of(decoder, layers, **inputs).flatten(0, 1)
+        for i, here in zip(chunk, packed, strict=True):
             states[tree.places[i]] = found[list(here)]
     output = FrozenOutput(layers, states)
     for row, there in zip(rows, tree.places, strict=False):  # those that fit

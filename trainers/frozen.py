@@ -42,10 +42,9 @@ def unchanged(states: torch.Tensor, *_: Any, **__: Any) -> torch.Tensor:
     return states
 
 
-def language_model(model: nn.Module) -> Any:
+def language_model(model: Any) -> Any:
     """The transformers model that `model` is, or that PEFT is around; its decoder is `.base_model`."""
-    wrapper: Any = model
-    return wrapper.get_base_model() if hasattr(model, "get_base_model") else model
+    return model.get_base_model() if hasattr(model, "get_base_model") else model
 
 
 def frozen_layers(model: nn.Module) -> list[nn.Module]:

@@ -23,6 +23,8 @@ from agentspec.carry import MemoryBank
 from agentspec.episode import Job, MakeEnv, Runner, make_env
 from agentspec.llm.base import LLM
 from agentspec.progress import episode_progress
+from agentspec.records.folder import EVALUATIONS, METRICS, last_complete_checkpoint
+from agentspec.records.log import RunLog
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
 from trainers.call_metrics import CallMetrics, truncated_calls
@@ -32,7 +34,7 @@ from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
 from trainers.counterfactuals import play_beside
 from trainers.counterfactuals import records as counterfactuals
 from trainers.credit import Credited, ScoredEpisode
-from trainers.distributed import KnownLayout, check_trained, is_sharded
+from trainers.distributed import check_layout, check_trained, is_sharded, keep_precision
 from trainers.finite import FiniteGuard, without_dropout
 from trainers.forward import frozen_output
 from trainers.frozen import FrozenOutput, frozen_layers, layer_above
@@ -43,15 +45,13 @@ from trainers.receipts import receipt_record, receipt_rows, settings
 from trainers.resume import ExactResume, restore_finished
 from trainers.rollouts import collect, local_llm, rollout_jobs
 from trainers.round_metrics import SamplingMetrics, episode_metrics, named, round_metrics
-from trainers.run_folder import EVALUATIONS, METRICS, last_complete_checkpoint
-from trainers.runlog import RunLog
 from trainers.sequences import Row
 from trainers.tree.model import enable_tree
 from trainers.validation import Validation
 from trainers.vllm import prepare_vllm, vllm_round
 
 
-class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
+class ScaffoldGRPOTrainer(ExactResume, OwnCards, Validation, PolicyLoss, GRPOTrainer):
     """GRPO whose rollouts are episodes of an agent.
 
     Args:
@@ -99,6 +99,12 @@ class ScaffoldGRPOTrainer(KnownLayout, ExactResume, OwnCards, Validation, Policy
         self._memory: bytes | None = args.starting_memory
         self._call_metrics = CallMetrics()
         self._sampling_metrics = SamplingMetrics()
+
+    def create_accelerator_and_postprocess(self) -> None:
+        """As transformers'; nothing is built on a parallel layout that would hang or round."""
+        super().create_accelerator_and_postprocess()
+        check_layout(self.accelerator, self.args)
+        keep_precision(self.accelerator)
 
     def train(self, resume_from_checkpoint: str | bool | None = None, **kwargs: Any) -> Any:
         """As TRL's, in a folder that belongs to this run; its manifest is written first, its records are sealed last.

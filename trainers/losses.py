@@ -151,11 +151,7 @@ REFUSED = {
 
 
 def loss(name: str) -> LossSpec:
-    """The row of `name`.
-
-    Raises:
-        SpecError: no such loss, or one that is not offered.
-    """
+    """The row of `name`; `SpecError` if there is none, or it is not offered."""
     if name in REFUSED:
         raise SpecError(f"loss_type {name!r} is not offered: {REFUSED[name]}; use one of {', '.join(LOSSES)}")
     if name not in LOSSES:

@@ -32,11 +32,6 @@ class ConfigParser(TrlParser):
         for action in self._actions:
             action.help = said.get(action.dest, action.help)
 
-    @property
-    def options(self) -> list[str]:
-        """Every option there is, spelled one way."""
-        return [option for action in self._actions for option in action.option_strings if "-" not in option[2:]]
-
     def error(self, message: str) -> NoReturn:
         raise SpecError(f"{self._source}: {message}; `--help` lists every field")
 

@@ -6,8 +6,7 @@ look; a second, frozen one lies in a folder of its own name beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,104 +28,71 @@ def load_policy(config: ScaffoldConfig) -> tuple[nn.Module, Any]:
 
     float32 on a CPU (bfloat16 is slower there), bfloat16 where the config says `bf16`. With `lora_r: 0` all
     weights are trained.
-
-    Raises:
-        LLMError: the model or adapter cannot be found.
-        SpecError: the adapter of a frozen actor is named.
     """
-    from peft import PeftModel, get_peft_model
-
     if config.actor_adapter:
         raise SpecError(
             f"actor_adapter {config.actor_adapter!r} is a frozen actor beside a trained reflector, and none is trained "
             "here; name it in `adapter` to train it, or use recipes/retroformer_delivery.py"
         )
-    adapter = resolve_adapter(config.adapter) if config.adapter else ""
-    model, tokenizer, path = _load_base(config)
-    if adapter:
-        with _loading(adapter):
-            policy = PeftModel.from_pretrained(model, adapter, is_trainable=True)
-        return _named(policy, path), tokenizer
-    if config.lora_r == 0:
-        return model, tokenizer
-    lora = _new_lora(model, config)
-    torch.manual_seed(config.seed)
-    return get_peft_model(model, lora), tokenizer
+    return _load(config, {TRAINED: config.adapter} if config.adapter or config.lora_r else {})
 
 
 def load_actor_and_reflector(config: ScaffoldConfig, run: str | Path = "") -> tuple[nn.Module, Any]:
     """One base with two adapters, and the tokenizer: the actor's, frozen, and the reflector's, active and trainable.
 
     Args:
-        config: `actor_adapter` is the actor's (empty: the actor is the base model), `adapter` what the reflector
-            starts from (empty: a new LoRA, which says what the base model says).
-        run: folder of a training run or of its checkpoint: both adapters come from there.
+    config: `actor_adapter` is the actor's (empty: a LoRA that nobody trains adds nothing, so the base model acts),
+        `adapter` what the reflector starts from (empty: a new LoRA, which says what the base model says).
+    run: folder of a training run or of its checkpoint: both adapters come from there.
+    """
+    if run:
+        return _load(config, {ACTOR: str(Path(run) / ACTOR), TRAINED: str(run)})
+    return _load(config, {ACTOR: config.actor_adapter, TRAINED: config.adapter})
+
+
+def _load(config: ScaffoldConfig, adapters: Mapping[str, str]) -> tuple[nn.Module, Any]:
+    """The base model with its tokenizer, and on it adapters by name, each from where it says or (empty) a new one.
 
     Raises:
-        LLMError: the model or an adapter cannot be found.
+    LLMError: the model or an adapter cannot be found.
     """
     from peft import PeftModel, get_peft_model
-
-    actor, reflector = config.actor_adapter, config.adapter
-    if run:
-        actor, reflector = str(Path(run) / ACTOR), str(run)
-    found = [resolve_adapter(name) if name else "" for name in (actor, reflector)]
-    model, tokenizer, path = _load_base(config)
-    new = [_new_lora(model, config) for _ in found]
-    torch.manual_seed(config.seed)
-    if found[0]:
-        with _loading(found[0]):
-            policy = PeftModel.from_pretrained(model, found[0], adapter_name=ACTOR, is_trainable=False)
-    else:
-        # A LoRA that nobody trains adds nothing: the base model, under a name that calls can be routed to.
-        policy = get_peft_model(model, new[0], adapter_name=ACTOR)
-    if found[1]:
-        with _loading(found[1]):
-            policy.load_adapter(found[1], TRAINED, is_trainable=True)
-    else:
-        policy.add_adapter(TRAINED, new[1])
-    policy.set_adapter(TRAINED)  # which also freezes the other one
-    return _named(policy, path), tokenizer
-
-
-def _load_base(config: ScaffoldConfig) -> tuple[nn.Module, Any, str]:
-    """Model, tokenizer and where they came from."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     from agentspec.llm.chat import set_template_kwargs
     from agentspec.llm.models import quiet, resolve
 
+    found = {name: resolve_adapter(adapter) if adapter else "" for name, adapter in adapters.items()}
     path = resolve(config.model).path
     dtype = torch.bfloat16 if config.bf16 and not config.use_cpu else torch.float32
     with quiet():
         model, tokenizer = AutoModelForCausalLM.from_pretrained(path, dtype=dtype), AutoTokenizer.from_pretrained(path)
     # Every prompt of the run is rendered with this tokenizer: rollouts on all backends, demonstrations, validation.
     set_template_kwargs(tokenizer, config.chat_template_kwargs or {})
-    return model, tokenizer, path
-
-
-@contextmanager
-def _loading(adapter: str) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError) as error:
-        raise LLMError(f"adapter {adapter!r} cannot be loaded: {error}") from error
-
-
-def _named(policy: Any, path: str) -> nn.Module:
-    """A shipped adapter names its base by alias; what is saved must name what PEFT itself can find."""
-    for config in policy.peft_config.values():
-        config.base_model_name_or_path = path
-    model: nn.Module = policy
-    return model
+    new = {name: _new_lora(model, config) for name, adapter in found.items() if not adapter}
+    torch.manual_seed(config.seed)
+    for name, adapter in found.items():
+        first, trained = not isinstance(model, PeftModel), name == TRAINED
+        try:
+            if adapter and first:
+                model = PeftModel.from_pretrained(model, adapter, adapter_name=name, is_trainable=trained)
+            elif adapter:
+                model.load_adapter(adapter, name, is_trainable=trained)
+            elif first:
+                model = get_peft_model(model, new[name], adapter_name=name)
+            else:
+                model.add_adapter(name, new[name])
+        except (OSError, ValueError) as error:
+            raise LLMError(f"adapter {adapter or name!r} cannot be loaded: {error}") from error
+    if found:
+        model.set_adapter(TRAINED)  # which also freezes the other one
+        for lora in model.peft_config.values():  # a shipped adapter names its base by alias, which PEFT cannot find
+            lora.base_model_name_or_path = path
+    return model, tokenizer
 
 
 def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
-    """Configuration of a new adapter for `model`.
-
-    Raises:
-        SpecError: more layers than the model has.
-    """
+    """Configuration of a new adapter for `model`, which has such modules and as many layers (else `SpecError`)."""
     from peft import LoraConfig
 
     layers = model.config.get_text_config().num_hidden_layers
@@ -143,12 +109,8 @@ def _new_lora(model: Any, config: ScaffoldConfig) -> Any:
     )
 
 
-def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
-    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection.
-
-    Raises:
-        SpecError: the model has no such module.
-    """
+def _targets(model: Any, config: ScaffoldConfig) -> list[str]:
+    """Names of the modules that carry LoRA; `all-linear` is every linear layer except the output projection."""
     names = [name for name, _ in model.named_modules()]
     if config.lora_targets != ["all-linear"]:
         there = {name.rpartition(".")[2] for name in names}
@@ -156,7 +118,5 @@ def _targets(model: nn.Module, config: ScaffoldConfig) -> list[str]:
             if not any(f".{name}".endswith(f".{target}") for name in names) or not target:
                 raise SpecError(f"lora_targets: {config.model} has no module {target!r}{suggest(target, there)}")
         return config.lora_targets
-    wrapper: Any = model
-    head = wrapper.get_output_embeddings()
-    named = model.named_modules()
+    head, named = model.get_output_embeddings(), model.named_modules()
     return sorted({n.rpartition(".")[2] for n, m in named if isinstance(m, nn.Linear) and m is not head})

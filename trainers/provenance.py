@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
 from itertools import groupby
 
 from agentspec.trajectory import Trajectory
-from agentspec.types import Completion, LLMCall
+from agentspec.types import LLMCall
 from trainers.sequences import TokenSequence
 
 
@@ -47,22 +46,3 @@ def _check_run(sequence: TokenSequence, start: int, end: int, call: LLMCall, epi
         yield f"the tokens before position {start} are not the prompt of {where}"
     if any(a is not None and len(a) == 1 and sequence.mask[start + i] for i, a in enumerate(matching[0].allowed)):
         yield f"{where} trains tokens that its constraint forced"
-
-
-def check_completion(completion: Completion, where: str) -> Iterator[str]:
-    """What cannot be true of a recorded completion, whoever wrote it.
-
-    Constraints must have left the token that was sampled; a log-probability is a number of at most 0, and that of a
-    forced token is 0.
-    """
-    ids, logprobs, allowed = completion.token_ids, completion.logprobs, completion.allowed
-    if (logprobs and len(logprobs) != len(ids)) or (allowed and len(allowed) != len(ids)):
-        yield f"{where} has {len(ids)} tokens, {len(logprobs)} log-probabilities and {len(allowed)} constraints"
-        return
-    if any(not math.isfinite(p) or p > 1e-5 for p in logprobs):
-        yield f"{where} has log-probabilities that are none (above 0, or not finite)"
-    for position, choice in enumerate(allowed):
-        if choice is not None and ids[position] not in choice:
-            yield f"{where}: its constraint does not hold token {position}, which was sampled"
-        if choice is not None and len(choice) == 1 and logprobs and abs(logprobs[position]) > 1e-5:
-            yield f"{where}: token {position} was forced, and its log-probability is not 0"

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.files import jsonable
+from agentspec.records.digests import short_digest
+from agentspec.records.folder import FORMAT
 from trainers.credit import FIELDS
-from trainers.digests import short_digest
-from trainers.runlog import FORMAT
 from trainers.sequences import Row
 
 LOSS_SETTINGS = (
@@ -65,13 +65,7 @@ def receipt_record(
     denominator: int,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """A receipt but for its chain.
-
-    Args:
-        round: number of the generation round: optimiser steps before it.
-        played: id and return of every episode of the round.
-        rows: of all ranks, as of `receipt_rows`.
-    """
+    """A receipt but for its chain: `played` are id and return of every episode, `rows` those of all ranks."""
     return {
         "format": FORMAT,
         "round": round,

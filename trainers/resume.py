@@ -22,10 +22,10 @@ from transformers import TrainerState
 from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR, TrainOutput, rotate_checkpoints
 
 from agentspec.files import write_atomic
+from agentspec.records.folder import STATE, TRAINER_STATE, hold, set_aside
 from agentspec.registry import SpecError
 from trainers.micro_batches import ROWS
 from trainers.mixin import Base
-from trainers.run_folder import STATE, TRAINER_STATE, hold, set_aside
 from trainers.sequences import Row, TokenSequence
 
 FORMAT = 2
@@ -36,10 +36,10 @@ class ScaffoldState:
     """Position and buffers of a run at a checkpoint.
 
     Args:
-        step: micro-batches done (TRL's `_step`).
-        round: number of the generation round that filled the buffer.
-        buffered: micro-batches of the round, each a list of rows; empty at a round's end.
-        memory: state of a memory with `scope: run`.
+    step: micro-batches done (TRL's `_step`).
+    round: number of the generation round that filled the buffer.
+    buffered: micro-batches of the round, each a list of rows; empty at a round's end.
+    memory: state of a memory with `scope: run`.
     """
 
     step: int
@@ -84,11 +84,7 @@ def restore_finished(trainer: Any, checkpoint: str | Path) -> TrainOutput | None
 
 
 def load_state(folder: str | Path, rank: int = 0) -> ScaffoldState | None:
-    """The state in a checkpoint folder; `None` if it holds none (a checkpoint of stock TRL).
-
-    Raises:
-        ValueError: a file of another format.
-    """
+    """The state in a checkpoint folder; `None` if it holds none (a checkpoint of stock TRL)."""
     path = Path(folder) / _name(rank)
     if not path.is_file():
         return None
@@ -155,9 +151,6 @@ class ExactResume(Base):
 
         What the folder holds beyond the checkpoint is dropped: the resumed run writes it again. A run that does not go
         on from a checkpoint of this folder begins anew: what is there is set aside.
-
-        Raises:
-            SpecError: another run is writing into the folder.
         """
         if not self.accelerator.is_main_process:
             self.accelerator.wait_for_everyone()  # nobody writes before the main process has cleared the folder

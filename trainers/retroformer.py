@@ -25,8 +25,8 @@ from accelerate.utils import gather_object
 from torch import nn
 
 from agentspec.episode import Job
-from agentspec.llm.base import LLM
 from agentspec.llm.recorder import derive_seed
+from agentspec.metrics import means
 from agentspec.reflection.retroformer import PATH
 from agentspec.spec import AgentSpec, ModuleSpec, load_yaml
 from agentspec.trajectory import Trajectory
@@ -47,13 +47,10 @@ FIRST_TRIALS = "first_trials"
 
 
 def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
-    """Make `config` train the reflector, and nothing else.
+    """Make `config` train the reflector, and nothing else; `SpecError` where it says otherwise.
 
     The agent's reflection becomes `retroformer` with `when: start` and its scope `run`; the lessons are the
     trained calls; the reward, unless one is given, is the change of return.
-
-    Raises:
-        SpecError: what is configured says otherwise (`trainers.checks.check_retroformer`).
     """
     agent = load_yaml(config.agent) if isinstance(config.agent, str) else config.agent
     if isinstance(agent, Mapping):  # lessons live from trial to trial, and a reflector refuses any other scope
@@ -72,17 +69,10 @@ def as_retroformer(config: ScaffoldConfig) -> ScaffoldConfig:
 class RetroformerTrainer(ScaffoldGRPOTrainer):
     """GRPO for the reflector of a frozen actor: `model` of `load_actor_and_reflector`, `args` of `as_retroformer`."""
 
-    def __init__(
-        self,
-        model: nn.Module,
-        args: ScaffoldConfig,
-        *,
-        make_llm: Callable[[nn.Module, Any], LLM] | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, model: nn.Module, args: ScaffoldConfig, **kwargs: Any) -> None:
         check_retroformer(args)
-        llm = partial(local_llm, batching=args.batching, adapters=ADAPTERS)
-        super().__init__(model, args, make_llm=make_llm or llm, **kwargs)
+        kwargs.setdefault("make_llm", partial(local_llm, batching=args.batching, adapters=ADAPTERS))
+        super().__init__(model, args, **kwargs)
         self._first_trials: list[ScoredEpisode] = []
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: Any = None) -> None:
@@ -110,15 +100,10 @@ class RetroformerTrainer(ScaffoldGRPOTrainer):
         """As for any run; also what the lessons were worth, and the trials they are about."""
         super()._log_episodes(credited)
         firsts = [e.trajectory for e in self._first_trials]
-        scored = [t for t in firsts if t.scorable]
-        gains = [float(t.metrics["reflection/reward"]) for t in self.last_episodes if t.scorable and has_lesson(t)]
-        for name, values in (
-            ("failed_first_trials", [float(is_due(t)) for t in scored]),
-            ("first_return", [float(t.metrics["return"]) for t in scored]),
-            ("gain", gains),
-        ):
-            if values:
-                self._metrics["train"][f"reflection/{name}"].append(sum(values) / len(values))
+        rows = [{"failed_first_trials": is_due(t), "first_return": t.metrics["return"]} for t in firsts if t.scorable]
+        rows += [{"gain": t.metrics["reflection/reward"]} for t in self.last_episodes if t.scorable and has_lesson(t)]
+        for name, value in means(rows).items():
+            self._metrics["train"][f"reflection/{name}"].append(value)
         self.run_log.trajectories(self._round, self.accelerator.process_index, firsts, FIRST_TRIALS)
 
 
@@ -127,13 +112,11 @@ def play_trials(
 ) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
     """The first trial of each group of jobs, and for every job the trial that follows it.
 
-    Args:
-        play: jobs -> episodes, in order.
-        jobs: groups one after the other; a group begins with rollout 0.
+    Where the first trial left no lesson to be written, it takes the episode's place (under the job's rollout number).
 
-    Returns:
-        first trials, one per group, and episodes, one per job; where the first trial left no lesson to be written, it
-        takes the episode's place (under the job's rollout number).
+    Args:
+    play: jobs -> episodes, in order.
+    jobs: groups one after the other; a group begins with rollout 0.
     """
     heads = [replace(j, run_seed=derive_seed(j.run_seed, "first trial")) for j in jobs if j.rollout == 0]
     firsts = play(heads)

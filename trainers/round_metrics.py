@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from trl.trainer.utils import nanstd
 
-from agentspec.metrics import figures
+from agentspec.metrics import figures, means
 from agentspec.trajectory import Trajectory
 from trainers.credit import Gather, ScoredEpisode
 from trainers.sequences import TrainFilter, trained_completions
@@ -45,13 +45,7 @@ def round_metrics(
     group: int,
     gather: Gather = list,
 ) -> dict[str, float]:
-    """Rewards as TRL computes them; lengths in trained tokens per episode, also of those that were not cut off.
-
-    Args:
-        episodes: this rank's.
-        weights: by reward.
-        group: rollouts per task.
-    """
+    """Rewards as TRL computes them (`weights` by reward, `group` rollouts per task), and lengths in trained tokens."""
     everyone: list[Played] = gather([Played.of(e, train) for e in episodes])
     values = torch.tensor([[math.nan if p.terms is None else p.terms[name] for name in weights] for p in everyone])
     totals = (values * torch.tensor(list(weights.values()))).sum(dim=1)
@@ -113,10 +107,7 @@ def _summary(values: Sequence[torch.Tensor], gather: Gather) -> tuple[float, dic
 
 def episode_metrics(trajectories: Sequence[Trajectory]) -> dict[str, float]:
     """`episode/NAME`: mean figures of the episodes that did not fail: what `agentspec.metrics.figures` says of each."""
-    rows = [figures(t) for t in trajectories if t.scorable]
-    names = dict.fromkeys(name for row in rows for name in row)
-    values = {name: [row[name] for row in rows if name in row] for name in names}
-    return {f"episode/{name}": sum(found) / len(found) for name, found in values.items()}
+    return {f"episode/{name}": mean for name, mean in means(figures(t) for t in trajectories if t.scorable).items()}
 
 
 def named(reward: str) -> Callable[..., Any]:

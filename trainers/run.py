@@ -11,6 +11,7 @@ from typing import Any
 from datasets import Dataset
 from transformers import PrinterCallback, ProgressCallback
 
+from agentspec.records.folder import hold, last_complete_checkpoint
 from agentspec.tasks import make_tasks
 from trainers.checks import notes
 from trainers.config import ScaffoldConfig
@@ -18,7 +19,6 @@ from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.report import Bar, TerminalReport
 from trainers.rollouts import task_rows
-from trainers.run_folder import hold, last_complete_checkpoint
 
 
 def train(

@@ -162,8 +162,3 @@ def _extendable(rows: list[TokenSequence], prompt: SequenceOf[int]) -> TokenSequ
     prompt = list(prompt)
     fitting = [r for r in rows if len(r) <= len(prompt) and prompt[: len(r)] == r.tokens]
     return max(fitting, key=len, default=None)
-
-
-def unmatched_patterns(paths: SequenceOf[str], train: TrainFilter) -> list[str]:
-    """Patterns of `train` that match none of the call `paths` an agent can make."""
-    return [p for p in train.patterns if not any(TrainFilter((p,)).matches(path) for path in paths)]

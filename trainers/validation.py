@@ -14,7 +14,7 @@ from typing import Any
 from accelerate.utils import gather_object
 
 from agentspec.episode import Job
-from agentspec.metrics import figures
+from agentspec.metrics import figures, means
 from agentspec.spec import AgentSpec
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
@@ -54,24 +54,16 @@ def validate(
     """
     metrics: dict[str, float] = {}
     for prefix, spec in scaffolds.items():
-        rows = gather([_figures(episode) for episode in play(spec, jobs[rank::ranks])])
+        rows = gather([_numbers(episode) for episode in play(spec, jobs[rank::ranks])])
         scored = [row for row in rows if row is not None]
-        metrics[f"{prefix}reward"] = _mean([row["reward"] for row in scored])
-        for name in dict.fromkeys(name for row in scored for name in row if name != "reward"):
-            metrics[f"{prefix}{name}"] = _mean([row[name] for row in scored if name in row])
-        metrics[f"{prefix}unscorable"] = 1 - len(scored) / len(rows)
+        found = {"reward": math.nan} | means(scored) | {"unscorable": 1 - len(scored) / len(rows)}
+        metrics |= {f"{prefix}{name}": value for name, value in found.items()}
     return metrics
 
 
-def _figures(episode: ScoredEpisode) -> dict[str, float] | None:
+def _numbers(episode: ScoredEpisode) -> dict[str, float] | None:
     """Numbers of one episode; `None` if it failed."""
-    if episode.score is None:
-        return None
-    return figures(episode.trajectory) | {"reward": episode.score.total}
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values) if values else math.nan
+    return None if episode.score is None else figures(episode.trajectory) | {"reward": episode.score.total}
 
 
 class Validation(Base):
@@ -80,14 +72,10 @@ class Validation(Base):
     def evaluate(
         self, eval_dataset: Any = None, ignore_keys: Any = None, metric_key_prefix: str = "eval"
     ) -> dict[str, float]:
-        """Play the validation tasks with the policy as it is.
+        """Play the validation tasks (rows of `trainers.rollouts.task_rows`) with the policy as it is.
 
         The trainer's random states, its buffers and the run's memory stay as they are: training goes on as if nothing
         had been evaluated.
-
-        Args:
-            eval_dataset: rows of `trainers.rollouts.task_rows`; default: the trainer's `eval_dataset`.
-            ignore_keys: not used.
         """
         rows = self.eval_dataset if eval_dataset is None else eval_dataset
         tasks = [task_of(row) for row in rows]

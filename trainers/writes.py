@@ -23,10 +23,10 @@ the paired baseline without memory is that of D2Skill.
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 from agentspec.actions import suggest
 from agentspec.registry import SpecError
@@ -143,8 +143,11 @@ def local(group: Sequence[Paired], values: Values) -> list[Advantages]:
         earned: Advantages = {}
         for step in sorted({r.plan.step for r in episode.returns}):
             mine = [r for r in episode.returns if r.plan.step == step and r.total is not None]
-            given = [[r.total for r in mine if r.plan.kept is kept] for kept in (True, False)]
-            earned[step] = _difference(given[0], given[1], values)  # type: ignore[arg-type]  # none is None
+            kept, withheld = ([r.total for r in mine if r.plan.kept is kept] for kept in (True, False))
+            earned[step] = 0.0
+            if kept and withheld:
+                scored = values([*kept, *withheld])  # type: ignore[list-item]  # none is None
+                earned[step] = fmean(scored[: len(kept)]) - fmean(scored[len(kept) :])
         found.append(earned)
     return found
 
@@ -163,14 +166,6 @@ def ablation(group: Sequence[Paired], values: Values) -> list[Advantages]:
     for n, i in enumerate(places):
         found[i] = {EVERY: scored[n] - scored[n + len(places)]}
     return found
-
-
-def _difference(ones: Sequence[float], others: Sequence[float], values: Values) -> float:
-    """Mean advantage of the ones less that of the others; 0 where either is missing."""
-    if not ones or not others:
-        return 0.0
-    scored = values([*ones, *others])
-    return math.fsum(scored[: len(ones)]) / len(ones) - math.fsum(scored[len(ones) :]) / len(others)
 
 
 def _local_plan(rule: WriteRule, steps: Sequence[int], seed: int) -> list[Plan]:
@@ -202,11 +197,7 @@ WRITE_CREDITS: dict[str, WriteCredit] = {
 
 
 def write_credit(name: str) -> WriteCredit:
-    """The row of `name`.
-
-    Raises:
-        SpecError: no such estimator.
-    """
+    """The row of `name`; `SpecError` with the nearest names if there is none."""
     if name not in WRITE_CREDITS:
         raise SpecError(f"unknown write_credit {name!r}{suggest(name, WRITE_CREDITS)}")
     return WRITE_CREDITS[name]

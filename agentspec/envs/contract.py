@@ -11,6 +11,9 @@ An environment is a `gymnasium.Env` that speaks text:
 - The class's `metadata` declares `metrics` (`agentspec.metrics.Metric`, the primary one first) and `typical_return`
   (above 0: the return of a good episode, by which searches scale rewards).
 
+Optional is `episodes(options) -> int | None`, a static method of the class: how many episodes an environment made with
+these options has, where a seed selects one of them modulo their number; `None` where every seed is another.
+
 Two things are optional, as methods of the innermost environment (`env.unwrapped`):
 
 - `snapshot() -> bytes` and `restore(blob)`: the exact state, random generators included. Searches in the environment

@@ -12,11 +12,12 @@ returns a `Player`. The reasoners `rule_based` and `random` play whatever the en
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, Protocol
 
 from agentspec.registry import SpecError
+from agentspec.state import dump_random, load_random
 
 Factory = Callable[..., "Player"]
 
@@ -35,6 +36,25 @@ class Player(Protocol):
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`."""
         ...
+
+
+class Chance:
+    """Uniform draws from what `offered` finds in the `info` of reset or step: a player of random actions."""
+
+    def __init__(self, rng: random.Random, offered: Callable[[Mapping[str, Any]], Sequence[str]]) -> None:
+        self._rng, self._offered = rng, offered
+
+    def act(self, info: Mapping[str, Any]) -> str:
+        """A random action."""
+        return self._rng.choice(self._offered(info))
+
+    def snapshot(self) -> bytes:
+        """The generator's state."""
+        return dump_random(self._rng)
+
+    def restore(self, blob: bytes) -> None:
+        """Go back to a `snapshot`."""
+        load_random(self._rng, blob)
 
 
 class NoPlayer(SpecError):  # noqa: N818 - read as a sentence in the message of a run
@@ -63,4 +83,4 @@ def player(env: str, role: str, options: Mapping[str, Any], rng: random.Random, 
     return factory(options, rng, **parameters)
 
 
-__all__ = ["NoPlayer", "Player", "player", "roles"]
+__all__ = ["Chance", "NoPlayer", "Player", "player", "roles"]

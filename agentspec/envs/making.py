@@ -9,14 +9,13 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 
 from agentspec.actions import suggest
+from agentspec.importing import look_here
 from agentspec.parameters import check_types
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.types import Task
@@ -107,8 +106,7 @@ def environment_class(name: str) -> Any:
 
 
 def _import(module: str, name: str) -> None:
-    if str(Path.cwd()) not in sys.path and "" not in sys.path:
-        sys.path.append(str(Path.cwd()))  # at the end: what lies there replaces nothing that is installed
+    look_here()
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:

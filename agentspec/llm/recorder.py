@@ -129,8 +129,9 @@ class Recorder:
         except Exception as error:
             self.backend_error = error
             raise
-        usage = replace(call.usage, cost=self.prices.cost(call.model or llm.name, call.usage))
-        call = replace(call, usage=usage)
+        model = call.model or llm.name
+        usage = replace(call.usage, cost=self.prices.cost(model, call.usage))
+        call = replace(call, usage=usage, model=model)
         self._tokens += usage.input_tokens + usage.output_tokens
         self._cost += usage.cost
         self.calls.append(call)

@@ -7,7 +7,7 @@ from collections import deque
 from agentspec.declaration import Declaration
 from agentspec.protocols import Services
 from agentspec.state import dump_state, load_state
-from agentspec.tokens import excerpt
+from agentspec.tokens import excerpt, news
 from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, Experience, Recall, RecallItem, Task, Transition
 
@@ -25,7 +25,7 @@ class BaseMemory:
 
     Args:
         window: steps kept.
-        observation_tokens: most tokens of each step's observation in the `snapshot` layout.
+        observation_tokens: most tokens of each step's observation in the `snapshot` layout, of what is new in it.
     """
 
     declaration = Declaration(
@@ -38,11 +38,13 @@ class BaseMemory:
             raise ValueError(f"memory base: window must be at least 1, got {window}")
         self.services = services
         self.observation_tokens = observation_tokens
+        self._before = ["", ""]  # the observation that was told last, and what came of the action then
         self._steps: deque[tuple[str, str]] = deque(maxlen=window)
         """What is told of a step, and as which kind of thing: a `step`, or a `failure`."""
 
     def begin_episode(self, task: Task) -> None:
         self._steps.clear()
+        self._before = ["", ""]
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         steps = list(self._steps)[-k:] if k else self._steps
@@ -53,15 +55,18 @@ class BaseMemory:
         seen = Experience.of(transition)
         line = seen.line()
         if self.observation_tokens and self.services.context.layout == "snapshot":
-            count = self.services.llm.count_tokens
-            line += f"\n   seen: {excerpt(transition.input.text, self.observation_tokens, count)}"
+            fresh = news(transition.input.text, *self._before)
+            self._before = [transition.input.text, seen.feedback]
+            if fresh:
+                line += f"\n   seen: {excerpt(fresh, self.observation_tokens, self.services.llm.count_tokens)}"
         self._steps.append((line, "step" if seen.ok else "failure"))
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         return None
 
     def snapshot(self) -> bytes:
-        return dump_state([list(step) for step in self._steps])
+        return dump_state([self._before, [list(step) for step in self._steps]])
 
     def restore(self, blob: bytes) -> None:
-        self._steps = deque(((line, kind) for line, kind in load_state(blob)), maxlen=self._steps.maxlen)
+        self._before, steps = load_state(blob)
+        self._steps = deque(((line, kind) for line, kind in steps), maxlen=self._steps.maxlen)

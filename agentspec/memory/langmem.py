@@ -21,7 +21,16 @@ from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, brief, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    DATA,
+    goal_of,
+    newest_steps,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -44,12 +53,12 @@ HEAD = "You manage the memory of an agent that acts in an environment.\n\nTask: 
 SEMANTIC = (
     "\n\nFacts on record that may be about the same:\n{facts}\n\nKeep the record of facts true: insert what is new and "
     "will matter later, patch (put a new text in place of the fact of that id) what has changed, delete what proved "
-    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits, none if "
-    "nothing is new. Answer with JSON:\n"
+    "wrong. One fact per entry, complete in itself, with numbers, ids and places. At most {most} edits and "
+    "{words} words in all, none if nothing is new. Answer with JSON:\n"
     '{{"edits": [{{"op": "insert" | "patch" | "delete", "id": number or null, "text": fact}}]}}'
 )
 EPISODIC = (
-    "\n\nWrite these steps down as one experience to learn from. Answer with JSON:\n"
+    "\n\nWrite these steps down as one experience to learn from, in at most {words} words. Answer with JSON:\n"
     '{{"observation": what the situation was, "thoughts": what mattered in it, "action": what was done, '
     '"result": what came of it, with numbers, and what would have been better}}'
 )
@@ -94,7 +103,8 @@ class LangMem:
         episode_every: steps between experiences, and between optimisations of the instructions (0: only at the end).
         query_limit: facts that are shown to the manager, and to the agent.
         episodes: experiences that are shown to the agent.
-        recent: newest steps that are shown where no conversation shows them.
+        recent: newest steps that are shown before all else, where the prompt does not tell them anyway (0: none);
+            older ones of which no facts have been made yet are shown where there is room.
         max_facts: most facts; the one written longest ago goes first.
         max_episodes: most experiences; the oldest go first.
         entry_tokens: most tokens of a fact, and of each field of an experience.
@@ -154,6 +164,7 @@ class LangMem:
         self.entry_tokens, self.instruction_tokens = entry_tokens, instruction_tokens
         self.state_tokens, self.steps_tokens = state_tokens, steps_tokens
         self.facts: dict[int, str] = {}
+        self._written: dict[int, int] = {}  # fact -> the episode in which it was written last
         self.episodes: dict[int, Episode] = {}
         self.instructions = ""
         self._steps: list[str] = []  # of this episode, as far back as something is still to be written of them
@@ -174,12 +185,10 @@ class LangMem:
             text = f"A past experience: {self.episodes[key].text}"
             items.append(RecallItem(text, score, "episodic", str(key), 1.0 + score))
         for key, score in self._nearest(self._fact_index, input.text, self.query_limit if k is None else k):
-            items.append(RecallItem(f"- {self.facts[key]}", score, "semantic", str(key), 2.0 + score))
-        if self.services.context.layout == "snapshot" and self.recent:
-            items += [
-                RecallItem(brief(text, self.services.llm.count_tokens), priority=5.0 + i)
-                for i, text in enumerate(self._steps[-self.recent :])
-            ]
+            items.append(RecallItem(self._dated(key), score, "semantic", str(key), 2.0 + score))
+        if self.recent:
+            waiting = self._steps[-max(self.recent, self._for_facts) :]
+            items += newest_steps(waiting, self.recent, self.services.llm.count_tokens)
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -217,8 +226,8 @@ class LangMem:
 
     async def _edit_facts(self, steps: Sequence[str], ending: str) -> None:
         near = self._nearest(self._fact_index, " ".join(steps), self.query_limit)
-        facts = "\n".join(f"{key}: {self.facts[key]}" for key, _ in near) or "(none)"
-        prompt = self._head(steps, ending) + SEMANTIC.format(facts=facts, most=EDITS)
+        facts = "\n".join(f"{key}: {self._dated(key)[2:]}" for key, _ in near) or "(none)"
+        prompt = self._head(steps, ending) + SEMANTIC.format(facts=facts, most=EDITS, words=self.answer_tokens // 2)
         answer = await self.services.ask("semantic", prompt, self.answer_tokens, json_of({"edits": list[Edit]}))
         for edit in answer.value["edits"][:EDITS] if answer.value else ():
             self._apply(edit)
@@ -237,10 +246,12 @@ class LangMem:
         if edit.op == "delete":
             self._fact_index.remove(key) if self._fact_index is not None else None
             return
+        self._written[key] = self.services.time().episode
         self._put(self.facts, self._fact_index, key, text, text, self.max_facts)
+        self._written = {key: self._written[key] for key in self.facts}
 
     async def _write_episode(self, steps: Sequence[str], ending: str) -> None:
-        prompt = self._head(steps, ending) + EPISODIC.format()
+        prompt = self._head(steps, ending) + EPISODIC.format(words=self.answer_tokens // 2)
         answer = await self.services.ask("episodic", prompt, self.answer_tokens, json_of(Episode))
         if answer.value is not None:
             episode = Episode(*(self._clip(text, self.entry_tokens) for text in astuple(answer.value)))
@@ -273,6 +284,11 @@ class LangMem:
         shown = newest_within(steps, self.steps_tokens, self.services.llm.count_tokens)
         return HEAD.format(task=self._task, steps="\n".join(shown + ([ending] if ending else [])))
 
+    def _dated(self, key: int) -> str:
+        """A fact as the agent reads it; one of an earlier episode says so, for it may be over."""
+        episode = self._written[key]
+        return f"- {self.facts[key]}" + ("" if episode == self.services.time().episode else f" [episode {episode + 1}]")
+
     def _clip(self, text: str, tokens: int) -> str:
         return clip_text(" ".join(text.split()), tokens, self.services.llm.count_tokens)
 
@@ -300,11 +316,13 @@ class LangMem:
 
     def snapshot(self) -> bytes:
         here = [self._steps, self._for_facts, self._for_episode, self._task]
-        return dump_state([list(self.facts.items()), keyed(self.episodes), self.instructions, here, self._counts])
+        facts = [[key, text, self._written[key]] for key, text in self.facts.items()]
+        return dump_state([facts, keyed(self.episodes), self.instructions, here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         facts, episodes, self.instructions, here, self._counts = load_state(blob)
-        self.facts = {key: text for key, text in facts}
+        self.facts = {key: text for key, text, _ in facts}
+        self._written = {key: episode for key, _, episode in facts}
         self.episodes = {key: Episode(*values) for key, values in episodes}
         self._steps, self._for_facts, self._for_episode, self._task = here
         self._build_indices()

@@ -20,7 +20,16 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.parts.steps import DATA, brief, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    DATA,
+    goal_of,
+    newest_steps,
+    newest_within,
+    outcome,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
@@ -49,7 +58,7 @@ RELATED = 3
 HEAD = (
     "You manage the memory of an agent that acts in an environment. Its stores: "
     + "; ".join(f"{name}: {about} ({', '.join(fields)})" for name, (about, fields) in STORES.items())
-    + ".\n\nTask: {task}\n\nCore memory:\n{core}\n\n"
+    + ".\n\nTask: {task}\n\n[{label}]\n{core}\n\n"
     + DATA
     + "\n{steps}"
 )
@@ -57,13 +66,15 @@ ROUTE = '\n\nWhich stores do these steps add to, or correct? Answer with JSON:\n
 RELATED_TO = "\n\nEntries that may be about the same:\n{entries}"
 EDIT = (
     "\n\nEdit the store `{store}`. Make one edit: insert (a new entry), merge (add to the entry of that id), update "
-    "(put new texts in place of those of that id), or none. Keep numbers, ids and places. Answer with JSON:\n"
+    "(put new texts in place of those of that id), or none. Keep numbers, ids and places, in at most {words} words. "
+    "Answer with JSON:\n"
     '{{"op": "insert" | "merge" | "update" | "none", "id": number or null, "fields": {{{fields}}}}}'
 )
 EDIT_ALL = (
     "\n\nEdit the stores: at most one edit each, none where nothing is new. insert (a new entry), merge (add to the "
-    "entry of that id), update (put new texts in place of those of that id). Keep numbers, ids and places. Answer with "
-    'JSON:\n{{"edits": [{{"store": name, "op": "insert" | "merge" | "update", "id": number or null, '
+    "entry of that id), update (put new texts in place of those of that id). Keep numbers, ids and "
+    "places, in at most {words} words in all. Answer with JSON:\n"
+    '{{"edits": [{{"store": name, "op": "insert" | "merge" | "update", "id": number or null, '
     '"fields": {{field: text}}}}]}}'
 )
 REWRITE = (
@@ -121,7 +132,8 @@ class Mirix:
         routing: `meta` or `single`.
         topic: `llm` or `state`.
         top: entries that each store gives.
-        recent: newest steps that are shown where no conversation shows them.
+        recent: newest steps that are shown before all else, where the prompt does not tell them anyway (0: none);
+            older ones that have not been flushed yet are shown where there is room.
         core_chars: most characters of the core memory; from 0.9 of it on it is rewritten.
         entry_tokens: most tokens of an entry's field.
         max_entries: most entries of each store; the one written longest ago goes first.
@@ -181,6 +193,7 @@ class Mirix:
         self.recent, self.core_chars, self.entry_tokens = recent, core_chars, entry_tokens
         self.max_entries, self.state_tokens, self.steps_tokens = max_entries, state_tokens, steps_tokens
         self.core = ""
+        self._old_core = False  # it was written in an earlier episode
         self.entries: dict[int, Entry] = {}
         self._steps: list[str] = []  # of this episode since the last flush, and the newest ones
         self._pending = 0
@@ -190,18 +203,18 @@ class Mirix:
 
     def begin_episode(self, task: Task) -> None:
         self._steps, self._pending = [], 0
+        self._old_core = bool(self.core)
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """Core memory, the best entries of every store, the newest steps."""
         query = await self._topic(input) if self.topic == "llm" and self.entries else input.text
-        items = [RecallItem(f"[core] {self.core}", kind="core", priority=4.0)] if self.core else []
+        items = [RecallItem(f"[{self._core_label}] {self.core}", kind="core", priority=4.0)] if self.core else []
         for store in SEARCHED:
             for key, score in self._search(store, query, self.top if k is None else k):
-                items.append(RecallItem(f"[{store}] {self.entries[key].text}", score, store, str(key), 1.0 + score))
-        if self.services.context.layout == "snapshot" and self.recent:
-            count = self.services.llm.count_tokens
-            newest = enumerate(self._steps[-self.recent :])
-            items += [RecallItem(brief(text, count), priority=5.0 + i) for i, text in newest]
+                items.append(RecallItem(self._shown(key), score, store, str(key), 1.0 + score))
+        if self.recent:
+            waiting = self._steps[-max(self.recent, self._pending) :]
+            items += newest_steps(waiting, self.recent, self.services.llm.count_tokens)
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -222,12 +235,12 @@ class Mirix:
         """Route what has gathered, and let each manager make its edit."""
         count, steps = self.services.llm.count_tokens, self._steps[-self._pending :]
         shown = newest_within(steps, self.steps_tokens, count) + ([ending] if ending else [])
-        head = HEAD.format(task=self._task, core=self.core or "(empty)", steps="\n".join(shown))
+        head = HEAD.format(label=self._core_label, task=self._task, core=self.core or "(empty)", steps="\n".join(shown))
         self._steps, self._pending = self._steps[-self.recent :] if self.recent else [], 0
         query = " ".join(steps)
         if self.routing == "single":
             related = [key for store in SEARCHED for key, _ in self._search(store, query, 1)]
-            prompt = head + self._related(related) + EDIT_ALL.format()
+            prompt = head + self._related(related) + EDIT_ALL.format(words=self.answer_tokens // 2)
             answer = await self.services.ask(
                 "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]})
             )
@@ -250,13 +263,24 @@ class Mirix:
         """The one edit of a store's manager."""
         related = [key for key, _ in self._search(store, query, RELATED)] if store != "core" else []
         fields = ", ".join(f'"{name}": text' for name in STORES[store][1])
-        prompt = head + self._related(related) + EDIT.format(store=store, fields=fields)
+        prompt = head + self._related(related) + EDIT.format(store=store, fields=fields, words=self.answer_tokens // 2)
         answer = await self.services.ask("edit", prompt, self.answer_tokens, json_of(Edit))
         return answer.value
 
     def _related(self, keys: Sequence[int]) -> str:
-        lines = [f"{key} [{self.entries[key].store}] {self.entries[key].text}" for key in keys]
+        lines = [f"{key} {self._shown(key)}" for key in keys]
         return RELATED_TO.format(entries="\n".join(lines)) if lines else ""
+
+    @property
+    def _core_label(self) -> str:
+        return "core, as of an earlier episode" if self._old_core else "core"
+
+    def _shown(self, key: int) -> str:
+        """An entry with its store; an event with its time, and whatever an earlier episode left with its episode."""
+        entry, now = self.entries[key], self.services.time().episode
+        when = [f"episode {entry.episode + 1}"] if entry.episode != now else []
+        when += [f"up to step {entry.step}"] if entry.store == "episodic" else []
+        return f"[{entry.store}] {entry.text}" + (f" [{', '.join(when)}]" if when else "")
 
     def _apply(self, store: str, edit: Edit) -> None:
         """An edit; one of an unknown store, field or id, or without a text, changes nothing and is counted."""
@@ -264,9 +288,8 @@ class Mirix:
             return
         count, now = self.services.llm.count_tokens, self.services.time()
         known = STORES.get(store, ("", ()))[1]
-        fields = {
-            n: clip_text(" ".join(edit.fields[n].split()), self.entry_tokens, count) for n in known if n in edit.fields
-        }
+        most = self.core_chars if store == "core" else self.entry_tokens
+        fields = {n: clip_text(" ".join(edit.fields[n].split()), most, count) for n in known if n in edit.fields}
         fields = {name: text for name, text in fields.items() if text}
         before = self.entries.get(-1 if edit.id is None else edit.id)
         addressed = before is not None and before.store == store
@@ -279,8 +302,8 @@ class Mirix:
         self._counts["edits"] += 1
         if store == "core":
             new = "" if fields["text"] in self.core else fields["text"]
-            text = fields["text"] if edit.op == "update" else f"{self.core}\n{new}".strip()
-            self.core = text[: self.core_chars]
+            self.core = fields["text"] if edit.op == "update" else f"{self.core}\n{new}".strip()
+            self._old_core = False
         elif edit.op == "insert" or before is None or edit.id is None:
             self._put(self.services.new_id(), Entry(store, fields, now.episode, now.step))
         else:
@@ -305,7 +328,10 @@ class Mirix:
         prompt = REWRITE.format(words=self.core_chars // 12, core=self.core)
         answer = await self.services.ask("rewrite", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, self.services.llm.count_tokens)
-        self.core = text[: self.core_chars] or self.core
+        if text:
+            self.core, self._old_core = text[: self.core_chars], False
+        elif len(self.core) > self.core_chars:  # what was written last is kept
+            self.core = self.core[-self.core_chars :]
 
     async def _topic(self, input: AgentInput) -> str:
         """What to search for: the model's topic, or the observation where it names none."""
@@ -348,9 +374,11 @@ class Mirix:
         return {**sizes, "core_chars": len(self.core), **self._counts}
 
     def snapshot(self) -> bytes:
-        return dump_state([self.core, keyed(self.entries), self._steps, self._pending, self._task, self._counts])
+        here = [self._steps, self._pending, self._task, self._old_core]
+        return dump_state([self.core, keyed(self.entries), here, self._counts])
 
     def restore(self, blob: bytes) -> None:
-        self.core, entries, self._steps, self._pending, self._task, self._counts = load_state(blob)
+        self.core, entries, here, self._counts = load_state(blob)
+        self._steps, self._pending, self._task, self._old_core = here
         self.entries = {key: Entry(*values) for key, values in entries}
         self._build_indices()

@@ -77,7 +77,9 @@ class SummaryMemory:
             return Recall()
         carried = [CARRY.format(summary=self._summary)] if self._summary else []
         items = [RecallItem(text, kind="summary", source="memory.summary", priority=math.inf) for text in carried]
-        since = [RecallItem(line, source="memory.summary", priority=i) for i, line in enumerate(self._lines)]
+        since = [
+            RecallItem(line, kind="step", source="memory.summary", priority=i) for i, line in enumerate(self._lines)
+        ]
         return Recall((*items, *since))
 
     async def store(self, transition: Transition) -> None:

@@ -324,7 +324,9 @@ class LanguageAgentTreeSearch:
         for child in children:
             child.prior = child.reward
         prompts = [with_request(search.base, self._request(child, RATE)) for child in alive]
-        sampling = {"n": self.evaluations, "max_tokens": self.prediction_tokens}
+        sampling: dict[str, Any] = {"n": self.evaluations, "max_tokens": self.prediction_tokens}
+        if self.evaluations > 1:
+            sampling["temperature"] = self.temperature  # greedy ratings would all be the same
         menu = bool(children) and bool(children[0].state.schema.choices)
         ratings = await rate(search.meter, prompts, constrained=menu and search.meter.constrains, **sampling)
         for child, rating in zip(alive, ratings, strict=False):  # fewer ratings when the budget ended among them

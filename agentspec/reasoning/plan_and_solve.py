@@ -16,13 +16,12 @@ sampled, so an episode stays one token sequence; the plan is shown again when th
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
-from agentspec.parameters import at_least, settings
+from agentspec.parameters import at_least, settings, without_effect
 from agentspec.prompting import (
     MAX_RETRIES,
     MENU_ANSWER,
@@ -36,6 +35,7 @@ from agentspec.prompting import (
     static_prompt,
     user_turn,
 )
+from agentspec.reasoning.plan_text import goals_of, says_done
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
 from agentspec.types import AgentInput, Decision, LLMCall, Recall, Task, Transition
@@ -64,14 +64,6 @@ THINK_MENU = (
 )
 ACT_MENU = "You are at sub-goal {number} of the plan: {goal}."
 SHOW_PLAN = "Plan:\n{plan}"
-
-_NUMBERED = re.compile(r"^[ \t]*(?:\(?\d+[.):]|[-*•])[ \t]*(\S.*)$", re.MULTILINE)
-_DONE = re.compile(
-    r"(?P<asked>\?\s*)?\bsub-?goal(?:\s+\d+)?(?:\s+(?:is|has been|was))?(?P<not>\s+(?:not|n't|never)\b)?(?:\s+\w+)?\s+"
-    r"(?:done|achieved|complete[d]?|finished)\b(?P<after>[^.\n]{0,40})",
-    re.IGNORECASE,
-)
-_DENIED = re.compile(r"\b(?:not|no|n't|never|until|once|when|if|yet|almost|nearly)\b|\?", re.IGNORECASE)
 
 
 class PlanAndSolve:
@@ -124,6 +116,18 @@ class PlanAndSolve:
     ) -> None:
         given = {"persistent": persistent, "think": think, "plan_tokens": plan_tokens}
         chosen = settings("plan_and_solve", PRESETS, preset, given)
+        if not chosen["persistent"]:
+            without_effect(
+                "plan_and_solve",
+                "persistent: true",
+                think=think is False,
+                replan_every=replan_every != 0,
+                replan_failures=replan_failures != 2,
+                replan_on=tuple(replan_on) != NEWS,
+                max_goals=max_goals != 5,
+                plan_tokens=plan_tokens is not None,
+                feedback_tokens=feedback_tokens != 128,
+            )
         at_least("plan_and_solve", 0, replan_every=replan_every, replan_failures=replan_failures)
         at_least("plan_and_solve", 0, max_retries=max_retries)
         at_least("plan_and_solve", 1, max_goals=max_goals, plan_tokens=chosen["plan_tokens"])
@@ -222,8 +226,8 @@ class PlanAndSolve:
         messages = self.services.context.prompt(static, f"{dynamic}\n\n{request}")
         call = await self.services.llm.generate("plan", messages, max_tokens=self.plan_tokens)
         self._plan = visible(call.text)[0]
-        goals = [goal.strip() for goal in _NUMBERED.findall(self._plan)] or [" ".join(self._plan.split())[:200]]
-        self._goals = [goal or "the task as a whole" for goal in goals][: self.max_goals]
+        goals = goals_of(self._plan) or [" ".join(self._plan.split())[:200] or "the task as a whole"]
+        self._goals = goals[: self.max_goals]
         self._at = self._age = 0
         self._failures, self._news = [], ""
         return call
@@ -300,14 +304,3 @@ def something_to_see(state: Mapping[str, Any]) -> bool:
     """Whether a state shows anything to plan for: it has no lists of offers and orders, or one of them is not empty."""
     known = [state[key] for key in ("offers", "orders") if key in state]
     return not known or any(known)
-
-
-def says_done(words: str) -> bool:
-    """Whether a step reports its sub-goal as done; "done? No, not yet" does not."""
-    words = visible(words)[0]
-    for match in _DONE.finditer(words):
-        start = words.rfind("\n", 0, match.start()) + 1
-        sentence = re.split(r"[.!;]\s", words[start : match.start()])[-1]
-        if not match["not"] and not _DENIED.search(match["after"]) and not _DENIED.search(sentence):
-            return True
-    return False

@@ -29,8 +29,8 @@ from typing import Any
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
 from agentspec.metrics import typical_return
-from agentspec.parameters import at_least, one_of, settings
-from agentspec.prompting import MAX_RETRIES, ON_REQUEST, static_prompt, user_turn, with_request
+from agentspec.parameters import at_least, one_of, settings, without_effect
+from agentspec.prompting import MAX_RETRIES, ON_REQUEST, require_variety, static_prompt, user_turn, with_request
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
 from agentspec.reasoning.search import mcts
@@ -211,6 +211,12 @@ class ReasoningViaPlanning(Stateless):
             evaluation=(evaluation, ("score", "samples")),
             output=(output, ("max_reward", "max_visits", "max_iter")),
         )
+        if evaluation == "score":
+            without_effect("rap", "evaluation: samples", eval_samples=eval_samples != 3)
+        elif reward == "normalised":
+            without_effect("rap", "evaluation: score", reward=True)
+        if chosen["num_actions"] > 1:
+            require_variety("rap", services, temperature)
         self.services = services
         self.iterations, self.depth, self.actions = chosen["num_iterations"], chosen["depth"], chosen["num_actions"]
         self.exploration = exploration

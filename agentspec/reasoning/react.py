@@ -31,7 +31,7 @@ from agentspec.prompting import (
 from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
-from agentspec.tokens import clip_text
+from agentspec.tokens import excerpt, news
 from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
 from agentspec.visible import visible
 
@@ -44,7 +44,8 @@ FORMAT_MENU = (
     "listed actions, word for word."
 )
 ACKNOWLEDGED = "OK."
-STOP = ("\nObservation:", "Observation:")
+STOP = ("\nObservation:",)
+"""Not where an answer begins with it: a model that first says what it sees would be stopped before its first word."""
 
 
 class ReAct:
@@ -55,7 +56,7 @@ class ReAct:
         thought_tokens: most tokens of a thought (`None`: the spec's `max_tokens`).
         history: steps of transcript shown in the `snapshot` layout.
         max_retries: further calls for an action that cannot be read.
-        observation_tokens: most tokens of each observation in that transcript, after what the environment said.
+        observation_tokens: most tokens of each observation in that transcript, of what is new in it.
     """
 
     declaration = Declaration(
@@ -82,15 +83,16 @@ class ReAct:
         self.max_retries = max_retries
         self.observation_tokens = observation_tokens
         self._transcript: list[str] = []
+        self._before = ["", ""]  # the observation that was told last, and what came of the action then
 
     def begin_episode(self, task: Task) -> None:
-        self._transcript = []
+        self._transcript, self._before = [], ["", ""]
 
     async def decide(self, input: AgentInput, recall: Recall) -> Decision:
         menu = bool(input.action_schema.choices)
         snapshot = self.services.context.layout == "snapshot"
-        transcript = "\n".join(self._transcript[-self.history :]) if snapshot else ""
-        dynamic = user_turn(input, recall, self.services, transcript=transcript)
+        told = self._transcript[-self.history :] if snapshot else []
+        dynamic = user_turn(input, recall, self.services, transcript="\n".join(told), steps=len(told))
         messages = self.services.context.prompt(static_prompt(input, FORMAT_MENU if menu else FORMAT), dynamic)
         return await self._loop(input, messages)
 
@@ -112,7 +114,9 @@ class ReAct:
                 return self._decision(Acted(reading, call, tuple(calls)), words)
             reply = ACKNOWLEDGED
             meant = isinstance(reading.action, ActionError) and (
-                reading.explicit or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                reading.explicit
+                or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
+                or not visible(call.text)[0]  # nothing is no thought
             )
             if meant and retries and not schema.choices:
                 assert isinstance(reading.action, ActionError)
@@ -144,16 +148,18 @@ class ReAct:
         thought = " ".join(thought.split()).removeprefix("Thought:").strip()
         self._see(transition.input.text)
         result = transition.info.get("error") or transition.info.get("message") or "done"
+        self._before = [transition.input.text, str(result)]
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
 
     def _see(self, observation: str) -> None:
         """Add to the step before what was observed after it; the newest observation stands in the prompt whole."""
-        if self._transcript and self.observation_tokens and self.services.context.layout == "snapshot":
-            seen = " ".join(observation.split())
-            self._transcript[-1] += f" | {clip_text(seen, self.observation_tokens, self.services.llm.count_tokens)}"
+        if not (self._transcript and self.observation_tokens and self.services.context.layout == "snapshot"):
+            return
+        if fresh := news(observation, *self._before):
+            self._transcript[-1] += f" | {excerpt(fresh, self.observation_tokens, self.services.llm.count_tokens)}"
 
     def snapshot(self) -> bytes:
-        return dump_state(self._transcript)
+        return dump_state([self._before, self._transcript])
 
     def restore(self, blob: bytes) -> None:
-        self._transcript = load_state(blob)
+        self._before, self._transcript = load_state(blob)

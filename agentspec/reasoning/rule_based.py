@@ -7,7 +7,6 @@ plays is declared by the environment (see `agentspec.envs.experts`).
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Mapping
 from typing import Any
@@ -17,6 +16,7 @@ from agentspec.declaration import Declaration
 from agentspec.envs.experts import NoPlayer, Player, player
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
+from agentspec.state import dump_random, load_random
 from agentspec.types import Action, AgentInput, Decision, Recall, Task
 
 
@@ -111,9 +111,8 @@ class RandomLegal(Stateless):
 
     def snapshot(self) -> bytes:
         """The state of the generator."""
-        return json.dumps(self.services.rng.getstate()).encode()
+        return dump_random(self.services.rng)
 
     def restore(self, blob: bytes) -> None:
         """Go back to a `snapshot`."""
-        version, internal, gauss = json.loads(blob)
-        self.services.rng.setstate((version, tuple(internal), gauss))
+        load_random(self.services.rng, blob)

@@ -25,7 +25,7 @@ from typing import Any
 from agentspec.actions import canonical
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message
-from agentspec.parameters import at_least, one_of, settings
+from agentspec.parameters import at_least, one_of, settings, without_effect
 from agentspec.prompting import MAX_RETRIES, ON_REQUEST, require_variety, static_prompt, user_turn, with_request
 from agentspec.protocols import Services
 from agentspec.reasoning.common import Stateless
@@ -110,7 +110,6 @@ class TreeOfThoughts(Stateless):
         temperature: of all calls.
         max_calls: most requests per decision (`None`: no limit).
         max_search_tokens: tokens after which a decision makes no further request (`None`: no limit).
-        course_tokens: budgets of prompt sections.
         thought_tokens: most tokens of a proposal or a judgement (`None`: the spec's `max_tokens`).
         max_retries: further calls for proposals of which none is an action, all of a decision together.
     """
@@ -157,8 +156,12 @@ class TreeOfThoughts(Stateless):
             evaluation_strategy=(evaluation_strategy, ("value", "estimate", "vote")),
             selection=(selection, ("greedy", "sample")),
         )
+        if search_strategy == "BFS":
+            without_effect("tot", "search_strategy: DFS", threshold=threshold != 0.5)
+        else:
+            without_effect("tot", "search_strategy: BFS", selection=selection != "greedy")
         at_least("tot", 0, max_retries=max_retries)
-        if generation == "sample":
+        if generation == "sample" or chosen["evaluations"] > 1:
             require_variety("tot", services, temperature)
         self.services = services
         self.strategy = search_strategy
@@ -253,7 +256,7 @@ class TreeOfThoughts(Stateless):
         form = AS_WORDS if menu and node.depth else AS_CALLS
         if menu and not node.depth:
             sampling = {"n": self.thoughts, "choices": menu, **self.sampling}
-            return Ask("propose", with_request(search.base, SAMPLE.format(form="")), sampling, "explored")
+            return Ask("propose", with_request(search.base, SAMPLE.format(form="").strip()), sampling, "explored")
         if self.propose:
             request = self._course(node) + PROPOSE.format(k=self.thoughts, form=form)
             return Ask("propose", with_request(search.base, request), self.sampling, "explored")

@@ -114,7 +114,8 @@ class SelfRefine:
 
     async def revise(self, input: AgentInput, recall: Recall, decision: Decision) -> Decision:
         """The decision, refined; as far as the budget allows."""
-        draft = Draft(input, user_turn(input, recall, self.services), decision)
+        transcript = self.services.context.transcript
+        draft = Draft(input, user_turn(input, recall, self.services, transcript=transcript), decision)
         draft.attempt(_shown(decision.action))
         draft.comment(self._reasons(decision.rationale))
         try:

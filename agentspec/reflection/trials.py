@@ -113,7 +113,7 @@ def trial_prompt(
     The task and its actions; earlier lessons; how it began, and the fullest view of the trial (the board of offers,
     say), in `view_tokens` and `fullest_tokens`; its steps with the thought behind each and what came of it, within
     `budget` tokens: of a long trial the older steps lose their thoughts first, and a line says how many are left out;
-    its return; the request.
+    its return and how it ended; the request.
     """
     first = trajectory.transitions[0].input
     count = services.llm.count_tokens
@@ -130,7 +130,8 @@ def trial_prompt(
         ),
         f"The steps of trial {log.trials}:\n{steps}",
         f"Its return was {episode_return(trajectory):g}"
-        + (f" (best so far {log.best:g})." if log.best is not None else "."),
+        + (f" (best so far {log.best:g}). " if log.best is not None else ". ")
+        + _end(trajectory),
         request,
     ]
     return (
@@ -142,6 +143,14 @@ def trial_prompt(
         ),
         user("\n\n".join(parts)),
     )
+
+
+def _end(trajectory: Trajectory) -> str:
+    """How a trial ended, in a sentence."""
+    last = trajectory.transitions[-1]
+    if not last.terminated:
+        return f"It was cut off after step {last.step + 1}."
+    return f"It ended with step {last.step + 1}{'' if trajectory.metrics.get('success', 1) else ', without success'}."
 
 
 def _steps_within(trajectory: Trajectory, budget: int, count: CountTokens) -> list[str]:

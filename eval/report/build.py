@@ -25,6 +25,7 @@ from eval.report.data import as_csv, as_parquet
 from eval.report.modules import modules_section
 from eval.report.sections import failures_section, learning_section, paper_section
 from eval.statistics import Estimate, least_p, minimum_detectable_effect, runs_mean
+from eval.store import EPISODES
 from eval.tables import difference_rows, differences, differences_caption, show, summarise, values_by_run
 
 Row = Mapping[str, Any]
@@ -63,6 +64,8 @@ def build_report(
     path = Path(results)
     path = path / "results.jsonl" if path.is_dir() else path
     if not path.is_file():
+        if (path.parent / EPISODES).is_file():
+            raise ValueError(f"the evaluation in {path.parent} has not ended; run its command again, it goes on")
         raise ValueError(f"there is no {path}; give the folder of an evaluation (agentspec eval --out FOLDER)")
     rows = read_lines(path)
     if not rows:

@@ -42,7 +42,7 @@ def modules_section(tasks: str, rows: Sequence[Row]) -> list[Block]:
                 heading=metric.heading,
                 digits=metric.digits,
                 higher_is_better=metric.higher_is_better,
-                caption=f"{policy}: {metric.heading} by reasoning and memory; {unit_of(mine)}.",
+                caption=f"{policy}: {metric.heading} by reasoning and memory; {unit_of(mine)}.{pooled(mine)}",
             ),
             *_interactions(mine, metric),
         ]
@@ -50,6 +50,25 @@ def modules_section(tasks: str, rows: Sequence[Row]) -> list[Block]:
     if len(kinds) > 1:
         blocks += [Heading(f"{tasks}: reflection", 3), _reflection(tasks, acting, [*kinds], metric)]
     return blocks
+
+
+def pooled(rows: Sequence[Row]) -> str:
+    """What else differs between the cells of reasoning x memory, or within one, as sentences; empty if nothing does."""
+    said = []
+    for key in ("layout", "scope"):
+        cells: dict[str, set[str]] = {}
+        for row in rows:
+            agent = row["agent"]
+            cells.setdefault(f"{agent['reasoning']} x {agent['memory']}", set()).add(str(agent.get(key, "")))
+        groups: dict[str, list[str]] = {}
+        for cell, values in cells.items():
+            groups.setdefault(" and ".join(sorted(values)), []).append(cell)
+        if len(groups) > 1 or any(len(values) > 1 for values in cells.values()):
+            most = max(groups, key=lambda value: len(groups[value]))
+            others = [f"{value} in {', '.join(of)}" for value, of in groups.items() if value != most]
+            where = "; ".join([*others, f"{most} in {'the others' if others else 'all cells, pooled'}"])
+            said.append(f" Scaffolds differ in {key} too ({where}), so a difference need not be the module's.")
+    return "".join(said)
 
 
 def _interactions(rows: Sequence[Row], metric: Metric) -> list[Block]:

@@ -10,6 +10,7 @@ from typing import Any
 from agentspec.failures import LEAVES
 from agentspec.files import read_lines
 from agentspec.metrics import primary_metric
+from agentspec.records.folder import METRICS
 from agentspec.trajectory import read_trajectories
 from eval import paper
 from eval.failures import OPEN, Diagnosis, Shares, by_scaffold, diagnose, paper_shares
@@ -18,7 +19,6 @@ from eval.report.blocks import Block, Heading, Table, Text
 from eval.tables import show, summarise
 
 Row = Mapping[str, Any]
-METRICS = "metrics.jsonl"
 WORLDS = {
     "agentspec/DeliveryBench": "deliverybench",
     "agentspec/MiniGrid": "minigrid",

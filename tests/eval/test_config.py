@@ -47,6 +47,15 @@ def test_a_file_says_what_is_played(tmp_path: Path) -> None:
     assert main(["eval", "--config", str(path), "--dry-run"]) == 0 and not (tmp_path / "out").exists()
 
 
+def test_a_file_may_hold_only_what_differs_from_another(tmp_path: Path) -> None:
+    write(tmp_path)
+    path = tmp_path / "more.yaml"
+    path.write_text("extends: matrix.yaml\nrollouts: 3\npolicies: {scripted: null, rule_based: {}}\n")
+    matrix = read_matrix(path)
+    assert [p.name for p in matrix.policies] == ["random", "rule_based"] and matrix.settings.rollouts == 3
+    assert set(matrix.scaffolds) == {"plain", "sheet"}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -75,6 +84,14 @@ def test_a_file_says_what_is_played(tmp_path: Path) -> None:
 def test_what_a_file_cannot_mean_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises((SpecError, ValueError), match=message):
         read_matrix(write(tmp_path, **changes))
+
+
+def test_one_episode_is_one_task(tmp_path: Path) -> None:
+    """A suite of ten has ten tasks, whatever their seeds are called."""
+    grid = {"env": "minigrid", "options": {"suite": "paper"}}
+    assert len(read_matrix(write(tmp_path, tasks={"grid": grid | {"seeds": "5-14"}})).tasks["grid"]) == 10
+    with pytest.raises(SpecError, match="11 seeds start 10 different episodes"):
+        read_matrix(write(tmp_path, tasks={"grid": grid | {"seeds": "0-10"}}))
 
 
 def test_a_label_that_stands_twice_is_refused(tmp_path: Path) -> None:

@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
 from agentspec.failures import LEAVES, Sign, in_a_row, is_failure, leading, revisits, signs
 from agentspec.llm.base import Request
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.types import Task
-from eval.failures import (
-    Agreement,
-    Judge,
-    agreement,
-    by_scaffold,
-    diagnose,
-    kappa,
-    paper_shares,
-    read_kind,
-    read_labels,
-    replayed,
-)
+from eval.failures import Judge, by_scaffold, diagnose, paper_shares, read_kind, replayed
 
 FETCH = Task("minigrid", 0, {"level": "MiniGrid-Fetch-5x5-N2-v0"})
 GOTO = Task("minigrid", 0, {"level": "MiniGrid-GoToObject-6x6-N2-v0"})
 EMPTY = Task("minigrid", 0, {"level": "MiniGrid-Empty-6x6-v0"})
+AGAIN = "understanding/state_confusion/history_misunderstood"
 COURIER = Task("deliverybench", 0, {"size": "tiny", "shift_hours": 1.0})
 
 
@@ -61,7 +48,8 @@ def test_taking_what_the_task_does_not_name(form: str) -> None:
 
 def test_running_into_walls_and_in_circles() -> None:
     found = leaves(EMPTY, *["FORWARD()"] * 8)  # 6x6: three steps to the wall, then it is in the way
-    assert {leaf for leaf, _ in found} == {"grounding/spatial/stuck"} and found[0][1] >= 4
+    assert {leaf for leaf, _ in found} == {"grounding/spatial/stuck", AGAIN} and found[0][1] >= 4
+    assert leading(signs(replayed(EMPTY, ["FORWARD()"] * 8))) == "grounding/spatial/stuck"
     hall = Task("minigrid", 3, {"level": "MiniGrid-Empty-16x16-v0"})  # whose walls are out of sight at first
     assert leaves(hall, *["FORWARD()"] * 8) == []
     circles = leaves(EMPTY, *["TURN_LEFT()"] * 12)  # each of four views is seen for the third time from step 8 on
@@ -69,7 +57,12 @@ def test_running_into_walls_and_in_circles() -> None:
 
 
 def test_acting_on_nothing_and_saying_done_elsewhere() -> None:
-    assert leaves(EMPTY, "PICK_UP()") == [("grounding/object/hallucination", 0)]
+    nothing = "grounding/object/hallucination"
+    assert leaves(EMPTY, "PICK_UP()") == [(nothing, 0)]
+    # Done again at once it is also a confusion, but no circle: nobody moved.
+    again = leaves(EMPTY, *["PICK_UP()"] * 4)
+    assert again == [(nothing, 0)] + [(leaf, step) for step in (1, 2, 3) for leaf in (nothing, AGAIN)]
+    assert (AGAIN, 2) not in leaves(EMPTY, "PICK_UP()", "TURN_LEFT()", "PICK_UP()")
     [(leaf, step)] = leaves(GOTO, "DONE()") or [("", 0)]
     assert leaf in ("grounding/spatial/distance", "grounding/object/hallucination") and step == 0
 
@@ -78,6 +71,54 @@ def test_money_and_time_misjudged() -> None:
     episode = replayed(COURIER, ["VIEW_ORDERS()", "VIEW_ORDERS()"])
     assert [s.leaf for s in signs(episode)] == ["understanding/state_confusion/history_misunderstood"]
     assert [s.leaf for s in signs(replayed(COURIER, ["WAIT(600)"]))] == ["understanding/knowledge/strategy"]
+
+
+def test_a_text_that_was_no_action_is_repeated_too() -> None:
+    assert (AGAIN, 1) in leaves(COURIER, "SLEEP(60)", "SLEEP(60)")
+    assert not any(leaf == AGAIN for leaf, _ in leaves(COURIER, "SLEEP(60)", "SLEEP(70)"))
+
+
+def test_a_copy_is_one_however_it_is_broken_into_lines() -> None:
+    shown = replayed(EMPTY, ["TURN_LEFT()"]).transitions[0].next_text
+    assert "\n" in shown[:150]
+    assert ("parse/unstructured_memory", 1) in leaves(EMPTY, "TURN_LEFT()", " ".join(shown.split())[:200])
+
+
+def test_what_a_refusal_of_the_courier_speaks_of() -> None:
+    accept = replayed(COURIER, ["VIEW_ORDERS()"]).transitions[0].input.state["offers"][0]["id"]
+    far = leaves(COURIER, f"ACCEPT_ORDER({accept})", f"PICKUP(orders=[{accept}])", "ACCEPT_ORDER(99)")
+    assert ("grounding/spatial/distance", 1) in far and ("parse/action_interface/parameter", 2) in far
+    assert leaves(COURIER, "CHARGE(target_pct=80)") == [("understanding/knowledge/rule_unfamiliar", 0)]
+
+
+def test_a_shift_that_leads_nowhere() -> None:
+    strategy = "understanding/knowledge/strategy"
+    waits = Task("deliverybench", 0, {"size": "tiny", "shift_hours": 1.0, "max_steps": 6})
+    assert leaves(waits, *["WAIT(60)"] * 4) == []  # four minutes, and the shift goes on
+    assert [step for leaf, step in leaves(waits, *["WAIT(60)"] * 6) if leaf == strategy] == [4, 5, 5]
+    strolls = leaves(waits, *["MOVE(20m, 60m)", "MOVE(60m, 60m)"] * 3)  # six steps, and nothing was fetched
+    assert (strategy, 5) in strolls and (strategy, 4) not in strolls
+    menu = Task("deliverybench", 0, {**waits.options, "action_mode": "menu", "observation": "compact"})
+    assert AGAIN in {leaf for leaf, _ in leaves(menu, *["more choices"] * 6)}
+    assert AGAIN not in {leaf for leaf, _ in leaves(menu, "more choices", "wait 1 minute", "more choices")}
+
+
+def test_moves_that_lead_nowhere() -> None:
+    strategy = ("understanding/knowledge/strategy", 11)
+    short = {"level": "MiniGrid-Empty-6x6-v0", "max_steps": 12}
+    assert strategy in leaves(Task("minigrid", 0, short), *["TURN_LEFT()"] * 12)
+    assert strategy not in leaves(Task("minigrid", 0, short), *["FORWARD()"] * 12)  # to the wall: more than two cells
+    assert strategy not in leaves(Task("minigrid", 0, short), *["PICK_UP()"] * 12)  # nothing that was possible
+    home = Task("robothor", 0, {"max_steps": 12})
+    assert strategy in leaves(home, *["ROTATE_LEFT()"] * 12)
+    assert (AGAIN, 4) in leaves(home, *["LOOK_DOWN()"] * 5)
+
+
+def test_circles_and_values_in_a_room() -> None:
+    room = Task("alfred", 4, {"max_steps": 9})
+    spins = [step for leaf, step in leaves(room, *["ROTATE_LEFT()"] * 9) if leaf == "grounding/spatial/stuck"]
+    assert all(step >= 8 for step in spins)  # four views, the third time round
+    assert leaves(room, "PICKUP()") == [("parse/action_interface/parameter", 0)]
 
 
 def test_the_leading_kind_and_the_diagnosis() -> None:
@@ -115,27 +156,6 @@ def test_shares_per_scaffold_count_failures_only() -> None:
     assert (shares.episodes, shares.failed, shares.share("grounding/spatial/stuck")) == (2, 2, 1.0)
     assert sum(paper_shares("minigrid").values()) == pytest.approx(1.0, abs=0.01)
     assert paper_shares("minigrid").keys() == set(LEAVES) and paper_shares("elsewhere") == {}
-
-
-def test_agreement_by_hand() -> None:
-    a, b = "grounding/spatial/stuck", "grounding/spatial/distance"
-    found = agreement([a, a, b], [a, b, "open"])
-    assert found[a] == Agreement(2, 1, 1) and (found[a].precision, found[a].recall) == (1.0, 0.5)
-    assert found[b] == Agreement(1, 1, 0) and found["all"] == Agreement(3, 2, 1)
-    # Agreement 3 of 4; by chance (2 * 3 + 2 * 1) / 16: (.75 - .5) / (1 - .5).
-    assert kappa(["x", "x", "y", "y"], ["x", "x", "y", "x"]) == pytest.approx(0.5)
-    with pytest.raises(ValueError, match="same items"):
-        kappa(["x"], [])
-
-
-def test_labels_are_read_and_checked(tmp_path: Path) -> None:
-    good = {"task": {"env": "minigrid", "seed": 0}, "actions": ["DONE()"], "label": "grounding/spatial/stuck"}
-    path = tmp_path / "labels.jsonl"
-    path.write_text(json.dumps(good) + "\n")
-    assert read_labels(path) == [good]
-    path.write_text(json.dumps(good | {"label": "lazy"}) + "\n")
-    with pytest.raises(ValueError, match="line 1: 'lazy' is none of"):
-        read_labels(path)
 
 
 def test_positions() -> None:

@@ -297,6 +297,27 @@ def test_prices_are_part_of_an_episode_that_they_can_end(tmp_path: Path) -> None
         assert made == played and rows[0]["ended"] == ended
 
 
+def test_changed_prices_change_the_costs_and_play_nothing(tmp_path: Path) -> None:
+    cheap, dear = (Prices({"scripted": Price(p, 2 * p)}) for p in (1.0, 3.0))
+    first, _ = play(tmp_path, policies=[SELLER], specs={"s": PLAIN}, prices=cheap)
+    again, made = play(tmp_path, policies=[SELLER], specs={"s": PLAIN}, prices=dear)
+    assert made == []
+    for before, after in zip(first, again, strict=True):
+        dollars = (before["input_tokens"] + 2 * before["output_tokens"]) / 1e6
+        assert before["cost"] == pytest.approx(dollars) and after["cost"] == pytest.approx(3 * dollars)
+        assert sum(sums["cost"] for sums in after["modules"].values()) == pytest.approx(3 * dollars)
+
+
+def test_a_store_without_usage_keeps_its_costs(tmp_path: Path) -> None:
+    first, _ = play(tmp_path, policies=[SELLER], specs={"s": PLAIN}, prices=Prices({"scripted": Price(1.0, 2.0)}))
+    path = tmp_path / "episodes.jsonl"
+    old = [{k: v for k, v in json.loads(line).items() if k != "usage"} for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps(record) + "\n" for record in old))
+    again, made = play(tmp_path, policies=[SELLER], specs={"s": PLAIN})
+    costs = [row["cost"] for row in first]
+    assert made == [] and min(costs) > 0 and [row["cost"] for row in again] == pytest.approx(costs)
+
+
 def test_a_sentence_encoder_counts_by_its_bytes(tmp_path: Path) -> None:
     store, digests = Store(tmp_path / "store"), []
     for weights in (b"a", b"b"):

@@ -23,6 +23,7 @@ from eval.report import build_report, write_files
 from eval.report.blocks import Figure, Table, Text, to_html, to_latex
 from eval.report.data import as_parquet
 from eval.report.figures import pareto_front
+from eval.report.modules import pooled
 from tests.toy_env import TOY
 
 SPECS = {
@@ -64,6 +65,18 @@ def test_a_report_has_its_sections_and_says_what_its_numbers_are(folder: Path) -
     assert all(caption.strip() for caption in captions)
     # What was read is named by its digest.
     assert "results.jsonl" in text and "SHA-256" in text
+
+
+def test_a_heat_map_says_what_else_its_cells_differ_in() -> None:
+    def row(reasoning: str, memory: str, layout: str) -> dict[str, Any]:
+        return {"agent": {"reasoning": reasoning, "memory": memory, "layout": layout, "scope": "episode"}}
+
+    alike = [row(r, m, "snapshot") for r in ("direct", "react") for m in ("none", "base")]
+    assert pooled(alike) == ""
+    text = pooled([row("direct", "none", "conversation"), *alike[1:]])
+    assert "differ in layout too (conversation in direct x none; snapshot in the others)" in text
+    text = pooled([row("direct", "none", "conversation"), *alike])
+    assert "conversation and snapshot in direct x none" in text
 
 
 def test_every_form_is_written_and_well_formed(folder: Path, tmp_path: Path) -> None:
@@ -114,6 +127,10 @@ def test_from_the_command_line(folder: Path, tmp_path: Path, capsys: pytest.Capt
         main(["report", str(tmp_path / "nowhere"), "--to", str(tmp_path / "x")])
     assert end.value.code == 2
     assert "give the folder of an evaluation" in capsys.readouterr().err
+    (tmp_path / "episodes.jsonl").touch()  # killed before it could write its rows
+    with pytest.raises(SystemExit):
+        main(["report", str(tmp_path), "--to", str(tmp_path / "x")])
+    assert "has not ended; run its command again" in capsys.readouterr().err
 
 
 def hand_made(folder: Path, rows: list[dict[str, Any]]) -> Any:

@@ -14,6 +14,7 @@ from agentspec.memory.ace.playbook import Bullet, Operation, Playbook, operation
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.state import joined
+from agentspec.tokens import estimate_tokens
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
 from tests.memory.recall_world import succeeds
 
@@ -237,3 +238,33 @@ def test_parameters() -> None:
 @pytest.mark.parametrize("preset", ["paper", "rl"])
 def test_a_fact_seen_long_ago_is_in_the_playbook(preset: str, layout: str, scope: str) -> None:
     assert succeeds({"name": "ace", "preset": preset}, scope=scope, layout=layout)
+
+
+def test_the_newest_bullets_and_the_last_review_are_shown_where_not_all_fit() -> None:
+    memory = ACE(services(Asked()), dedupe=0)
+    for i in range(40):
+        memory.playbook.apply(
+            Operation("ADD", "FACTS", content=f"Fact number {i} about the mill."), memory.services.new_id
+        )
+    memory.playbook.tag("fac-00003", "helpful")
+    memory._last = "Look before you leap."
+    shown = asyncio.run(memory.retrieve(seen("now"))).render(300, estimate_tokens)
+    assert "Last review: Look before you leap." in shown and "number 3 " in shown
+    assert "number 39 " in shown and "number 0 " not in shown
+
+
+def test_ids_are_read_in_brackets_and_a_strange_tag_loses_no_review() -> None:
+    playbook = Playbook([Bullet(0, "STRATEGIES", "Go."), Bullet(1, "STRATEGIES", "Run.")])
+    new = iter(range(2, 9)).__next__
+    assert playbook.apply(Operation("UPDATE", id="[str-00000]", content="Walk."), new) == Bullet(
+        0, "STRATEGIES", "Walk."
+    )
+    assert playbook.tag("[str-00001]", "helpful") and not playbook.tag("[str-00009]", "helpful")
+    assert playbook.merge(["[str-00000]", "[str-00001]"], "Walk or run.") == Bullet(0, "STRATEGIES", "Walk or run.", 1)
+    assert playbook.apply(Operation("REMOVE", id="[str-00000]"), new) is None and len(playbook) == 0
+    tags = [{"id": "str-00000", "tag": "Helpful"}, {"id": "str-00001", "tag": "useful"}]
+    script = Asked(reflect=json.dumps({"insight": "Go.", "bullets": tags}), curate='{"operations": []}')
+    memory = ACE(services(script), dedupe=0)
+    memory.playbook = Playbook([Bullet(0, "STRATEGIES", "Go."), Bullet(1, "STRATEGIES", "Run.")])
+    learn(memory, step(0, "a"))
+    assert [b.helpful for b in memory.playbook] == [1, 0] and script.purposes == ["reflect", "curate"]

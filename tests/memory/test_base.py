@@ -44,6 +44,26 @@ def test_steps_that_a_conversation_has_let_go_are_told() -> None:
     assert told == [[], [], [], [1, 2], [1, 2], [1, 2, 3, 4]]
 
 
+def test_what_is_new_is_told_of_an_observation() -> None:
+    """The mission, and that the agent turned, are known: the room goes to what is in view."""
+    seen: list[str] = []
+
+    def script(request: Request) -> str:
+        seen.append(request.messages[-1].text)
+        return "turn left"
+
+    options = {"suite": "memory", "observation": "compact", "action_mode": "menu", "max_steps": 4}
+    size = {"observation_tokens": 130}  # a scripted model counts characters
+    for reasoning in ("direct", {"name": "react", **size}):
+        seen.clear()
+        agent = AgentSpec.from_data({"reasoning": reasoning, "memory": {"name": "base", **size}, "layout": "snapshot"})
+        Runner(agent, ScriptedLLM(script)).run([Job(Task("minigrid", 0, options))])
+        told = [turn for turn in seen if "Mission:" in turn][-1]
+        assert told.count("Mission: go to the matching object") <= 2  # of the first step, and of this one
+        assert "In view: green key 2 forward, 1 right; green ball 1 forward, 3 left" in " ".join(told.split())
+        assert "turned left | Last: turned left" not in told and "seen: Last: turned left" not in told
+
+
 def test_the_state_is_restored_with_what_is_told_of_it() -> None:
     from agentspec.llm.recorder import Recorder
 

@@ -153,3 +153,19 @@ def test_a_fact_seen_long_ago_is_in_the_task_or_the_template(preset: str, layout
     # Under `scope: run` the question's own first state holds no fact: it comes from the template of the episode before.
     memory = {"name": "bot", "preset": preset, "threshold": 0.0}
     assert succeeds(memory, scope=scope, layout=layout)
+
+
+def test_a_long_distilled_task_keeps_its_whole_sentences_and_a_long_episode_its_end() -> None:
+    long = "Key facts: two mills. Constraints: one hour. " + "Goal: earn " + "very " * 400 + "much."
+    script = Asked(distil=long, template=template("Deliveries."))
+    memory = BufferOfThought(services(script), preset="rl", answer_tokens=64)
+    asyncio.run(memory.retrieve(seen("a town")))
+    assert memory._problem == "Key facts: two mills. Constraints: one hour."
+    assert "in at most 32 words" in script.prompt()
+    for i in range(70):
+        asyncio.run(memory.store(step(i, f"house {i}", f"GO({i})", message="went past a house, and on")))
+    asyncio.run(memory.end_episode(episode(step(0, "x"), step(1, "y"))))
+    memory.begin_episode(TASK)
+    asyncio.run(memory.retrieve(seen("a town")))
+    asked = next(script.prompt(i) for i, name in enumerate(script.purposes) if name == "template")
+    assert "70. GO(69)" in asked and "The episode ended after 2 steps." in asked and "are left out" in asked

@@ -139,7 +139,7 @@ def test_summaries_of_clusters_that_touch_are_linked_and_summed_up_in_turn() -> 
         memory.levels[0].graph.connect(100 + a, 100 + b)
     memory.levels[0].touch([100 + i for i in range(5)])
     for level in range(3):
-        asyncio.run(memory._summarise(level, 99, "Deliver."))
+        asyncio.run(memory._summarise(level, 99))
     assert (
         len(memory.parents[0]) == 2 and len(memory.parents[1]) == 1 and len(list(memory.levels[1].graph.edges())) == 1
     )

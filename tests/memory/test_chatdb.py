@@ -219,3 +219,13 @@ def test_no_statement_makes_a_note_of_megabytes() -> None:
         value = f"replace({value}, 'a', '{'a' * 20}')"
     assert database.run(f"INSERT INTO notes(note) VALUES ({value})", 3).startswith("error: ")
     assert database.rows("SELECT count(*) FROM notes") == [(0,)]
+
+
+def test_a_result_that_counts_steps_says_from_where() -> None:
+    asked = Asked(query=chain(("worst", "SELECT step, reward FROM steps"), ("all", "SELECT count(*) FROM steps")))
+    memory = db(asked, mode="chain", recent=0)
+    learn(memory, step(0, "a", reward=-1.0))
+    assert recall(memory, "b") == [
+        "worst (steps and episodes count from 0):\nstep: 0, reward: -1.0",
+        "all:\ncount(*): 1",
+    ]

@@ -98,7 +98,8 @@ def test_the_cadence_and_what_a_snapshot_layout_shows_between() -> None:
     assert len(script.requests) == 1 and shown(memory) == "Cheat sheet:\n- a\n4. WAIT() -> done"
     talk = DynamicCheatsheet(services(script, context=Context("conversation")), every=3)
     learn(talk, step(0, "s0"))
-    assert shown(talk) == ""
+    kinds = [item.kind for item in asyncio.run(talk.retrieve(seen("s1"))).items]
+    assert kinds == ["step"]  # left out where the conversation tells it
 
 
 def test_what_an_episode_leaves_is_curated_when_the_next_one_begins() -> None:
@@ -126,7 +127,7 @@ def test_similar_steps_stand_least_similar_first_with_their_similarity() -> None
     assert not script.requests  # nothing to look up
     texts = ("red door closed", "red door", "green hill far away")
     learn(memory, *(step(i, text, f"GO({i})") for i, text in enumerate(texts)))
-    assert shown(memory, "red door") == "Cheat sheet:\n- s"
+    assert shown(memory, "red door") == "Cheat sheet:\n- s\n3. GO(2) -> done"
     # "red door": features red, door, "red door". It shares all three with itself: similarity 1. With "red door closed"
     # (features red, door, closed, and two pairs: five) it shares three: 3 / sqrt(3 * 5) = 0.77.
     asked = script.prompt()
@@ -211,3 +212,17 @@ def test_a_transcript_of_the_steps_is_not_told_twice() -> None:
     assert "1. WALK() ->" not in prompt
     [_], reader = walk(memory, delay=4)
     assert "1. WALK() ->" in [r for r in reader.asked if not r.tag.module.startswith("memory.")][-1].messages[-1].text
+
+
+@pytest.mark.parametrize(
+    "written", ["Here is the new sheet:\n\n- a\n- b: c", "The sheet:\n```\n- a\n- b: c\n```", "- a\n- b: c"]
+)
+def test_a_bare_sheet_loses_what_a_model_says_before_it(written: str) -> None:
+    assert read_sheet(written, tags=False) == "- a\n- b: c"
+    assert read_sheet("Prices:\npizza 5", tags=False) == "Prices:\npizza 5"
+
+
+def test_the_newest_step_is_in_sight_where_the_curator_is_not_told_of_it() -> None:
+    memory = DynamicCheatsheet(services(Asked(synthesise=SHEET.format("a"))), variant="rs", every=1)
+    learn(memory, step(0, "s0"), step(1, "s1"))
+    assert shown(memory) == "Cheat sheet:\n- a\n2. WAIT() -> done"

@@ -25,7 +25,7 @@ class Two:
     dim = 2
 
     def embed(self, texts):
-        return np.array([TABLE[text] for text in texts], dtype=np.float32)
+        return np.array([TABLE[text.split()[0]] for text in texts], dtype=np.float32)
 
 
 def stream(weights: Weights, *rows: tuple[str, float, int], capacity: int = 100) -> Stream:
@@ -79,10 +79,19 @@ def test_what_is_recalled_is_recent_again() -> None:
 
 def test_the_best_are_the_same_however_many_there_are() -> None:
     rng = np.random.default_rng(0)
-    rows = [(("near", "half", "far")[i % 3], float(rng.integers(0, 4)), int(rng.integers(0, 5))) for i in range(60)]
+    rows = [
+        (f"{('near', 'half', 'far')[i % 3]} {i}", float(rng.integers(0, 4)), int(rng.integers(0, 5))) for i in range(60)
+    ]
     made = stream(Weights(1, 1, 1, 0.9), *rows)
     whole = np.argsort(-made.scores("query", 6), kind="stable")[:7]
     assert [m.id for m, _ in made.recall("query", 7, 6)] == whole.tolist()
+
+
+def test_what_says_the_same_is_recalled_once_and_only_that_is_recent_again() -> None:
+    made = stream(Weights(0, 0, 1, 0.9), ("near", 0, 0), ("half", 0, 1), ("near", 0, 2))
+    assert [m.id for m, _ in made.recall("query", 2, 7)] == [0, 1]
+    made.weights = Weights(1, 0, 0, 0.9)
+    assert made.scores("query", 7).tolist() == [1.0, 1.0, 0.0]
 
 
 def test_over_capacity_the_one_used_longest_ago_goes() -> None:

@@ -95,7 +95,7 @@ def test_only_steps_that_cost_something_are_left_out_of_the_chain() -> None:
     episode(bench, 0.0, -0.5, 2.0)
     prompt = bench.prompt("steps")
     assert "succeeded (return +1.50)" in prompt and "Deliver food." in prompt
-    assert "[step 1]" in prompt and "[step 3]" in prompt and "[step 2]" not in prompt
+    assert "1. GO(0)" in prompt and "3. GO(2)" in prompt and "2. GO(1)" not in prompt
     assert bench.purposes() == ["steps"]
     assert bench.shown() == "An earlier episode succeeded (return +1.50, 3 steps): 1. GO()"
 
@@ -214,3 +214,23 @@ def test_gmemory_recalls_the_episode_before() -> None:
 
 def text_of(request) -> str:
     return request.messages[-1].text
+
+
+def test_the_step_that_made_an_episode_fail_is_in_the_question_for_its_mistake() -> None:
+    bench = Bench(NAME, ANSWERS, scope="run")
+    bench.step("a store", "BUY(5)", "bought 5 drinks", reward=-30.0)
+    bench.step("a town", "DROP_OFF(1)", "delivered", reward=8.0)
+    bench.end(success=False)
+    bench.recall("a town")
+    assert "1. BUY(5) -> bought 5 drinks (-30.00)" in bench.prompt("mistake")
+
+
+def test_the_end_of_a_long_episode_is_in_its_question() -> None:
+    bench = Bench({**NAME, "preset": "rl", "trial_tokens": 400}, ANSWERS, scope="run")
+    for i in range(60):
+        bench.step(f"a long way past house {i}, with nothing to be seen", f"GO({i})", f"went past house {i}")
+    bench.step("a ditch", "JUMP()", "fell into the ditch", reward=-1.0)
+    bench.end(success=False)
+    bench.recall("a town")
+    prompt = bench.prompt("mistake")
+    assert "1. GO(0)" in prompt and "61. JUMP() -> fell into the ditch (-1.00)" in prompt

@@ -115,3 +115,18 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     for preset in ("paper", "rl"):
         assert succeeds({"name": "langmem", "preset": preset}, scope=scope, layout=layout)
+
+
+def test_a_fact_of_an_earlier_episode_says_so() -> None:
+    asked = Asked(semantic=[facts({"op": "insert", "text": "Order 3 is in the bag."}), facts()])
+    memory = langmem(asked, types=["semantic"])
+    learn(memory, step(0, "the mill"))
+    assert recall(memory, "order") == ["- Order 3 is in the bag."]
+    again = langmem(asked, types=["semantic"])
+    again.restore(memory.snapshot())
+    again.services.clock.episode = 1
+    assert recall(again, "order") == ["- Order 3 is in the bag. [episode 1]"]
+    learn(again, step(0, "the mill"))
+    assert "0: Order 3 is in the bag. [episode 1]" in asked.prompt()
+    again._apply(Edit("patch", 0, "Order 3 is delivered."))
+    assert recall(again, "order") == ["- Order 3 is delivered."]

@@ -177,3 +177,15 @@ def test_lightmem_recalls_what_a_short_window_has_lost() -> None:
     assert not succeeds({"name": "base", "window": 5})
     assert succeeds(memory, curate={"extract": extract})
     assert succeeds(memory, curate={"extract": extract}, scope="run")
+
+
+def test_a_compressed_state_keeps_numbers_with_their_names_and_its_paragraphs() -> None:
+    bench = Bench({**NAME, "rate": 0.6, "sensory_tokens": 10_000, "step_tokens": 400})
+    for minute in range(4):
+        orders = f"order 2: ready in {30 - minute} s, restaurant 4 (99.8m, -223.7m) 183m, 7 min 57 s left"
+        bench.step(f"{minute} min on the clock, energy 9{minute}%\n\n{orders}\n\nnear: car_rental 1 (22.3m, -128.9m)")
+    told = bench.memory.sensory[-1].text
+    assert "restaurant 4" in told and "(99.8m, -223.7m)" in told and " | " in told
+    words = told.partition("\n")[0].split()
+    for i, word in enumerate(words):
+        assert word != "min" or words[i - 1].isdigit()

@@ -6,8 +6,11 @@ import json
 
 import pytest
 
+from agentspec.memory.mem0 import Mem0Memory
 from agentspec.registry import SpecError
+from agentspec.tokens import estimate_tokens
 from tests.memory.bench import Bench
+from tests.memory.by_hand import Asked, learn, services, step
 from tests.memory.recall_world import succeeds
 
 ONE = {"name": "mem0", "every": 1, "summary_every": 0, "repairs": 0}
@@ -144,3 +147,21 @@ def test_nothing_is_asked_when_an_earlier_episode_left_nothing_after_all() -> No
     bench.memory._left = True  # steps were left, and written since, before anything was recalled
     bench.recall("a key")
     assert bench.purposes() == []
+
+
+def test_a_long_answer_of_the_environment_does_not_fill_the_recall() -> None:
+    bench = Bench({"name": "mem0", "recent": 3, "every": 9, "step_tokens": 60}, {})
+    bench.step("a town", "LOOK()", "street\n" * 400)
+    (item,) = bench.recall("a town").items
+    assert item.text.startswith("1. LOOK() -> street street") and len(item.text) <= 60  # a token is a byte here
+
+
+def test_a_decision_has_room_to_repeat_every_fact() -> None:
+    facts = [
+        f"Restaurant {i} at (139.6m, 24.0m) had the food of order {i} ready 5 min after it was accepted."
+        for i in range(4)
+    ]
+    asked = Asked(extract=json.dumps({"facts": facts}), update=json.dumps(ops()))
+    learn(Mem0Memory(services(asked), preset="rl", every=1), step(0, "a town"), step(1, "a town"))
+    room = asked.requests[asked.purposes.index("update")].sampling.max_tokens
+    assert room >= estimate_tokens(json.dumps(ops(*(("UPDATE", i, fact) for i, fact in enumerate(facts)))))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from dataclasses import replace
 
 import pytest
 
 from agentspec.context import Context
-from agentspec.memory.memgpt import CARRY, MemGPT
+from agentspec.memory.memgpt import CARRY, FunctionCall, MemGPT
 from agentspec.registry import SpecError
-from tests.memory.by_hand import TASK, Asked, learn, recall, services, step
+from agentspec.tokens import estimate_tokens
+from agentspec.types import Recall
+from tests.memory.by_hand import TASK, Asked, learn, recall, seen, services, step
 from tests.memory.recall_world import succeeds
 
 
@@ -37,7 +41,7 @@ def test_blocks_are_edited_by_functions_and_always_shown() -> None:
     assert recall(memory, "a")[:2] == ["[task] Open: order 3.", "[strategy] Charge at 20 %."]
     learn(memory, step(1, "b"))
     assert memory.blocks["task"] == "Open: order 4." and asked.purposes == ["edit", "edit"]
-    assert "task (14 of 2000): Open: order 3." in asked.prompt(1)
+    assert "task (14 of 384): Open: order 3." in asked.prompt(1)
 
 
 def test_a_block_that_is_full_is_an_error_that_goes_back_to_the_model() -> None:
@@ -101,10 +105,10 @@ def inserted(text: str):
 
 
 def test_warning_and_eviction_at_their_thresholds() -> None:
-    # A message "Step 1: WAIT() -> done | in: aaa..." of 32 + 47 = 79 characters is 20 tokens, 21 with its line break.
+    # A message "Step 1: WAIT() -> done | in: 0aa..." of 32 + 47 = 79 characters is 20 tokens, 21 with its line break.
     asked = Asked(edit=NONE, summary="It went on.")
     memory = gpt(asked, every=100, queue_tokens=112)
-    states = [("a" * 47) for _ in range(6)]
+    states = [f"{i}{'a' * 46}" for i in range(6)]
     sizes = []
     for i, state in enumerate(states):
         learn(memory, step(i, state))
@@ -197,3 +201,30 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     for preset in ("paper", "rl"):
         assert succeeds({"name": "memgpt", "preset": preset}, scope=scope, layout=layout)
+
+
+@pytest.mark.parametrize(("recall_tokens", "layout", "room"), [(512, "snapshot", 384), (512, "conversation", 768)])
+def test_what_stands_in_the_blocks_is_always_shown_whole(recall_tokens: int, layout: str, room: int) -> None:
+    """Both blocks as full as they may be, beside a full queue."""
+    context = Context(layout, recall_tokens=recall_tokens, count_tokens=estimate_tokens)
+    memory = MemGPT(services(Asked(edit=NONE), context=context), every=99)
+    assert memory.room == room and MemGPT(services(context=Context("snapshot", recall_tokens=1800))).room == 1350
+    learn(memory, *(step(i, f"{i} " + "b" * 120) for i in range(4)))
+    for name in ("task", "strategy"):
+        assert memory._call(FunctionCall("core_append", name, "x y " * (room // 4))) == "core_append: done"
+        assert "Error" in memory._call(FunctionCall("core_append", name, "more"))
+    recall = asyncio.run(memory.retrieve(seen("now")))
+    shown = Recall(tuple(i for i in recall.items if layout == "snapshot" or i.kind != "step"))
+    text = shown.render(recall_tokens, estimate_tokens)
+    assert all(f"[{name}] {memory.blocks[name]}" in text for name in ("task", "strategy"))
+
+
+def test_what_a_search_found_stays_until_the_next_search_and_once() -> None:
+    asked = Asked(edit=[calls({"function": "recall_search", "query": "mill"}), NONE, NONE])
+    memory = gpt(asked)
+    learn(memory, step(0, "a mill"))
+    memory.recall[77] = replace(next(iter(memory.recall.values())), step=9)
+    memory._words.put(77, memory.recall[77].text)
+    learn(memory, step(1, "b"))
+    assert memory._found == ["Step 1: WAIT() -> done | in: a mill"]
+    assert memory._recall_search(FunctionCall("recall_search", query="mill")).count("a mill") == 1

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agentspec.memory.memorybank import Entry, MemoryBank, avoid_by_rule, by_rule, retention
+from agentspec.memory.memorybank import MemoryBank
+from agentspec.memory.memorybank.entries import Entry, avoid_by_rule, by_rule, retention
 from agentspec.registry import SpecError
 from tests.memory.by_hand import TASK, Asked, episode, learn, recall, services, step
 from tests.memory.recall_world import succeeds
@@ -193,3 +194,13 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     assert succeeds({"name": "memorybank", "forget": "threshold"}, scope=scope, layout=layout)
     assert succeeds({"name": "memorybank", "preset": "rl"}, scope=scope, layout=layout)
+
+
+def test_a_summary_of_an_earlier_episode_says_that_it_is_over() -> None:
+    asked = Asked(summary="Order 3 is in the bag.", insight=CONCLUDED)
+    memory = bank(asked, every=1, raw=0, recent=0, insights=0)
+    learn(memory, step(0, "a mill"))
+    assert recall(memory, "order 3")[0] == "[Trajectory Summary] Order 3 is in the bag."
+    memory.services.clock.episode = 1
+    memory.begin_episode(TASK)
+    assert recall(memory, "order 3")[0] == "[Trajectory Summary] (Episode 1, over) Order 3 is in the bag."

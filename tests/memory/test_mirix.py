@@ -8,7 +8,7 @@ import pytest
 
 from agentspec.memory.mirix import Edit, Mirix
 from agentspec.registry import SpecError
-from tests.memory.by_hand import Asked, learn, recall, services, step
+from tests.memory.by_hand import TASK, Asked, learn, recall, services, step
 from tests.memory.recall_world import succeeds
 
 
@@ -134,3 +134,34 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     for preset in ("paper", "rl"):
         assert succeeds({"name": "mirix", "preset": preset}, scope=scope, layout=layout)
+
+
+def test_what_an_earlier_episode_left_says_so_and_an_event_says_when() -> None:
+    asked = Asked(edit_all='{"edits": []}')
+    memory = mirix(asked, routing="single", every=1)
+    memory.services.clock.step = 4
+    memory._apply("core", Edit("insert", fields={"text": "Order 3 is in the bag."}))
+    memory._apply("vault", Edit("insert", fields={"name": "mill"}))
+    memory._apply("episodic", Edit("insert", fields={"event": "Met the miller."}))
+    here = ["[core] Order 3 is in the bag.", "[episodic] Met the miller. [up to step 4]", "[vault] mill"]
+    assert recall(memory, "mill") == here
+    memory.services.clock.episode = 1
+    memory.begin_episode(TASK)
+    old = ["[core, as of an earlier episode] Order 3 is in the bag."]
+    old += ["[episodic] Met the miller. [episode 1, up to step 4]", "[vault] mill [episode 1]"]
+    assert recall(memory, "mill") == old
+    learn(memory, step(0, "mill"))
+    assert "[core, as of an earlier episode]" in asked.prompt() and "[vault] mill [episode 1]" in asked.prompt()
+    memory._apply("core", Edit("update", fields={"text": "Order 4 is new."}))
+    assert recall(memory, "mill")[0] == "[core] Order 4 is new."
+
+
+@pytest.mark.parametrize(("written", "kept"), [("Short.", "Short."), ("", "ORD 10 is at the quay.")])
+def test_the_core_is_rewritten_before_anything_of_it_is_cut(written: str, kept: str) -> None:
+    added = edit("insert", text="ORD 10 is at the quay.")
+    asked = Asked(route='{"stores": ["core"]}', edit=added, rewrite=written)
+    memory = mirix(asked, every=1, core_chars=40)
+    memory.core = "The agent is a courier with a car."
+    learn(memory, step(0, "a"))
+    assert "The agent is a courier with a car.\nORD 10 is at the quay." in asked.prompt()  # whole, 57 of 40 signs
+    assert memory.core.endswith(kept) and len(memory.core) <= 40

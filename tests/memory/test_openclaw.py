@@ -42,9 +42,9 @@ def test_edits_change_what_they_name_and_nothing_else() -> None:
         Edit("add", "", "no name"),
         Edit("add", "no text", " "),
     ):
-        memory._apply(edit)
-    assert memory.rules == {"Battery": "Charge below 20 %.", "Hot food": "Deliver within 4 min."}
-    memory._apply(Edit("remove", "Battery"))
+        memory.workspace.apply(edit)
+    assert memory.workspace.rules == {"Battery": "Charge below 20 %.", "Hot food": "Deliver within 4 min."}
+    memory.workspace.apply(Edit("remove", "Battery"))
     assert recall(memory, "") == ["- **Hot food**: Deliver within 4 min."]
 
 
@@ -54,41 +54,42 @@ def test_steps_are_learnt_from_every_so_often() -> None:
     )
     memory = claw(asked, every=2)
     learn(memory, *(step(i, f"room {i}", f"GO({i})") for i in range(5)))
-    assert asked.purposes == ["learn", "learn"] and memory.rules == {"a": "No."}
+    assert asked.purposes == ["learn", "learn"] and memory.workspace.rules == {"a": "No."}
     assert "- a: Go." in asked.prompt(1) and "GO(3)" in asked.prompt(1) and "GO(4)" not in asked.prompt(1)
 
 
 @pytest.mark.parametrize("answer", ["", "prose", '{"edits": [{"op": "burn", "name": "a"}]}', '{"edits": "x"}'])
 def test_a_bad_answer_edits_nothing_and_is_counted(answer: str) -> None:
     memory = claw(Asked(learn=answer), every=1)
-    memory._apply(Edit("add", "a", "Stay."))
+    memory.workspace.apply(Edit("add", "a", "Stay."))
     learn(memory, step(0, "x"))
-    assert memory.rules == {"a": "Stay."} and memory.services.llm.recorder.problems["memory.m", "malformed"] == 1
+    assert memory.workspace.rules == {"a": "Stay."}
+    assert memory.services.llm.recorder.problems["memory.m", "malformed"] == 1
 
 
 def test_memory_md_keeps_its_budget_and_drops_what_was_written_longest_ago() -> None:
     memory = claw(memory_tokens=20)
     for name in "abcd":
-        memory._apply(Edit("add", name, "word " * 4))
+        memory.workspace.apply(Edit("add", name, "word " * 4))
     # A line has 2 + 5 + 2 + 19 = 28 characters with its break about 29, the heading 10: 2 lines are 68 characters, 18
     # tokens; 3 are 97, 25 tokens.
-    assert list(memory.rules) == ["c", "d"] and estimate_tokens(rules_text(memory.rules)) <= 20
-    memory._apply(Edit("add", "long", "word " * 100))
-    assert list(memory.rules) == ["long"] and memory.rules["long"].endswith(" ...")
+    assert list(memory.workspace.rules) == ["c", "d"] and estimate_tokens(rules_text(memory.workspace.rules)) <= 20
+    memory.workspace.apply(Edit("add", "long", "word " * 100))
+    assert list(memory.workspace.rules) == ["long"] and memory.workspace.rules["long"].endswith(" ...")
 
 
 @given(st.dictionaries(st.text(), st.text(), max_size=4))
 def test_memory_md_reads_as_it_was_written(given_rules: dict[str, str]) -> None:
     memory = claw()
     for name, text in given_rules.items():
-        memory._apply(Edit("add", name, text))
-    assert rules_of(rules_text(memory.rules)) == memory.rules
+        memory.workspace.apply(Edit("add", name, text))
+    assert rules_of(rules_text(memory.workspace.rules)) == memory.workspace.rules
 
 
 def test_a_skill_is_listed_and_read_when_it_fits() -> None:
     memory = claw(skill_least=0.2)
-    memory._apply(Edit("skill", "Charge the scooter", "1. MOVE\n2. CHARGE", "battery low scooter"))
-    memory._apply(Edit("skill", "Cool a bag", "1. BUY ice", "melting ice cream"))
+    memory.workspace.apply(Edit("skill", "Charge the scooter", "1. MOVE\n2. CHARGE", "battery low scooter"))
+    memory.workspace.apply(Edit("skill", "Cool a bag", "1. BUY ice", "melting ice cream"))
     shown = recall(memory, "the scooter battery is low")
     assert shown[0] == "Skill Charge the scooter (battery low scooter):\n1. MOVE\n2. CHARGE"
     assert shown[1] == "Other skills: Cool a bag (melting ice cream)"
@@ -104,7 +105,7 @@ def test_what_was_learnt_takes_precedence_over_what_was_given(tmp_path: Path) ->
     )
     memory = claw(skills=str(tmp_path), skill_least=0.0)
     assert recall(memory, "stairs") == ["Skill Climb (stairs):\nGo up."]
-    memory._apply(Edit("skill", "climb", "Take the lift.", "stairs"))
+    memory.workspace.apply(Edit("skill", "climb", "Take the lift.", "stairs"))
     assert recall(memory, "stairs") == ["Skill climb (stairs):\nTake the lift."]
     assert "Go up." not in memory.snapshot().decode()
     (tmp_path / "climb" / "SKILL.md").write_text("no front matter", encoding="utf-8")
@@ -200,7 +201,7 @@ def dreamer(answer: str) -> OpenClaw:
         Asked(learn=NONE, dream=answer), least_score=0.1, least_recalls=2, least_queries=2, recent=0, least=0.0
     )
     for name in "abcd":
-        memory._apply(Edit("add", name, f"Rule {name}."))
+        memory.workspace.apply(Edit("add", name, f"Rule {name}."))
     memory.begin_episode(TASK)
     learn(memory, step(0, "a red key in room 5"))
     recall(memory, "red key")
@@ -216,11 +217,11 @@ def rewritten(names: str) -> str:
 def test_dreaming_promotes_and_refuses_a_rewrite_that_loses_too_much() -> None:
     # Of 4 rules, 3 kept is a loss of 25 %: allowed. 2 kept is 50 %: refused.
     memory = dreamer(rewritten("abce"))
-    assert memory.rules == {n: f"New {n}." for n in "abce"} and memory.metrics()["promoted"] == 1
+    assert memory.workspace.rules == {n: f"New {n}." for n in "abce"} and memory.metrics()["promoted"] == 1
     asyncio.run(memory._dream())
     assert memory.metrics()["promoted"] == 1, "what is promoted is not promoted again"
     memory = dreamer(rewritten("abef"))
-    assert memory.rules == {n: f"Rule {n}." for n in "abcd"}
+    assert memory.workspace.rules == {n: f"Rule {n}." for n in "abcd"}
     assert (memory.metrics()["promoted"], memory.metrics()["rewrites_refused"]) == (0, 1)
     assert [kept_share({"a": "", "b": ""}, {"a": ""}), kept_share({}, {})] == [0.5, 1.0]
 
@@ -242,8 +243,8 @@ def test_paths_never_leave_the_workspace(path: str) -> None:
 
 def test_exports_stay_in_their_folder(tmp_path: Path) -> None:
     memory = claw(every=9)
-    memory._apply(Edit("skill", "../../evil name", "Do it.", "never"))
-    memory._apply(Edit("add", "a", "Go."))
+    memory.workspace.apply(Edit("skill", "../../evil name", "Do it.", "never"))
+    memory.workspace.apply(Edit("add", "a", "Go."))
     learn(memory, step(0, "room"))
     target = tmp_path / "out"
     written = sorted(str(p.relative_to(target)) for p in memory.files().export(target))
@@ -263,7 +264,7 @@ def test_exports_stay_in_their_folder(tmp_path: Path) -> None:
 
 def test_the_log_is_bounded_and_snapshots_are_exact() -> None:
     memory = claw(max_log=3, every=2, half_life=2.0)
-    memory._apply(Edit("skill", "climb", "Up.", "stairs"))
+    memory.workspace.apply(Edit("skill", "climb", "Up.", "stairs"))
     learn(memory, *(step(i, f"room {i}") for i in range(5)))
     recall(memory, "room 1")
     assert [c.step for c in memory.log.values()] == [2, 3, 4]
@@ -300,3 +301,17 @@ def test_a_fact_seen_long_ago_decides(scope: str, layout: str) -> None:
     assert not succeeds({"name": "base", "window": 5}, scope=scope, layout=layout)
     for preset in ("paper", "rl"):
         assert succeeds({"name": "openclaw", "preset": preset}, scope=scope, layout=layout)
+
+
+def test_a_rewrite_has_room_for_all_rules_there_may_be() -> None:
+    """A memory as full as it may be: its rewrite, in JSON, fits into the answer."""
+    rules = {f"rule number {i}": "When the energy is below 20 %, rest before the next order." for i in range(40)}
+    asked = Asked(dream="{}")
+    memory = claw(asked, preset="rl", least_score=0.1, least_recalls=1, least_queries=1, recent=0)
+    memory.workspace.write(rules)
+    memory._append("The bus leaves at 12:40.", 0)
+    memory.log.recalled(0, 0.9, "bus", 0)
+    asyncio.run(memory._dream())
+    whole = json.dumps({"rules": [{"name": name, "text": text} for name, text in memory.workspace.rules.items()]})
+    assert len(memory.workspace.rules) > 10
+    assert asked.requests[-1].sampling.max_tokens >= estimate_tokens(whole) > memory.answer_tokens

@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from agentspec.memory.parts.entries import Entry
 from agentspec.registry import SpecError
 from agentspec.services import Time
 from tests.memory.bench import Bench, Rows
@@ -167,3 +168,9 @@ def test_simplemem_recalls_what_a_short_window_has_lost() -> None:
     keep = {"compress": lambda request: json.dumps(written(*notes(request)))}
     assert not succeeds({"name": "base", "window": 5})
     assert succeeds(memory, curate=keep) and succeeds(memory, curate=keep, scope="run")
+
+
+def test_enough_needs_no_further_queries() -> None:
+    bench = Bench({**NAME, "plan": True}, {"plan": {"queries": ["mill"]}, "check": {"enough": True}})
+    bench.memory.entries.put(Entry(0, "The mill is closed.", Time(0, 0, 0), {"keywords": [], "names": [], "topic": ""}))
+    assert "The mill is closed." in bench.shown("a mill") and not bench.problems()

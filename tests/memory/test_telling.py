@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import step_text
 from agentspec.tokens import estimate_tokens, excerpt
+from agentspec.types import Experience
 from tests.memory.one_step import step
 
 
@@ -25,7 +29,12 @@ def test_a_course_keeps_what_was_done_and_shares_the_rest_among_states() -> None
     assert [line for line in told if line[0] in "123"] == [line for _, line in steps]
     assert [len(line) for line in told if line.startswith("State: ")] == [29, 29] and len("\n".join(told)) == 99
     assert telling.course(steps, 45, len) == "1. GO -> ok\n2. TAKE -> no\n3. WAIT -> ok"  # no room to say anything
-    assert telling.course(steps, 20, len) == "1. GO -> ok\n2. T ..."
+    # No room for all of them: the newest and the first ones stay, and how many are missing is said.
+    assert telling.course(steps, 20, len) == "3. WAIT -> ok"
+    many = [["", f"{i}. GO -> ok"] for i in range(1, 8)] + [["", "It failed."]]
+    left = "(5 steps between these are left out)"
+    assert telling.course(many, 74, len) == f"1. GO -> ok\n{left}\n7. GO -> ok\nIt failed."
+    assert telling.course(many, 8, len) == "It f ..."
     assert telling.course([["s", "1. GO -> ok"]], 40, len) == "State: s\n1. GO -> ok"
 
 
@@ -49,3 +58,13 @@ def test_an_excerpt_of_an_observation_keeps_the_orders() -> None:
 def test_an_excerpt_stays_within_its_budget(text: str, tokens: int) -> None:
     assert excerpt(text, tokens) == "" or estimate_tokens(excerpt(text, tokens)) <= tokens
     assert len(excerpt(text, tokens, len)) <= tokens
+
+
+def test_what_failed_is_never_told_as_done() -> None:
+    failed = Experience.of(step(0, "s", "JUMP()", error="there is no such action", message=""))
+    assert (failed.ok, failed.feedback) == (False, "there is no such action")
+    silent = replace(step(0, "s", "JUMP()"), info={"invalid": True})
+    assert (Experience.of(silent).ok, Experience.of(silent).line()) == (False, "1. JUMP() -> failed")
+    unread = replace(step(0, "s", "JUMP()", error="no action in it"), info={})
+    assert Experience.of(unread).line() == "1. JUMP() -> no action in it"
+    assert step_text(silent, 0, len) == "JUMP() failed: failed"

@@ -198,7 +198,7 @@ def test_communities_that_changed_are_summed_up_between_episodes() -> None:
     bench.step("one")
     assert "community" not in bench.purposes()
     bench.end()
-    assert "- Mill and port." in bench.shown("at the mill")
+    assert "- Of earlier episodes: Mill and port." in bench.shown("at the mill")
     assert "Mill and port." not in bench.shown("at the inn")  # names nothing of the community
     bench.step("two")
     bench.end()

@@ -11,7 +11,7 @@ import pytest
 from agentspec.llm.base import Request
 from agentspec.llm.recorder import Recorder
 from agentspec.llm.scripted import ScriptedLLM
-from agentspec.reasoning.plan_and_solve import says_done
+from agentspec.reasoning.plan_text import says_done
 from agentspec.spec import AgentSpec
 from agentspec.types import Action, ActionSchema, AgentInput, Decision, Transition
 from tests.reasoning.player import OPERATIONS, last, named, operations, play, purposes, seen, solve, solved

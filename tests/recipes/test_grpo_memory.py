@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("trl")
 pytest.importorskip("peft")
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from recipes.common import CONFIGS
 from recipes.grpo_memory import main
@@ -21,8 +22,7 @@ from trainers.arguments import parse_config
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.counterfactuals import FOLDER
-from trainers.memory import as_memory
-from trainers.runlog import RunLog
+from trainers.presets import as_memory
 from trainers.writes import WRITE_CREDITS
 
 SHEET = {"name": "dynamic_cheatsheet", "preset": "rl", "every": 1, "sheet_tokens": 8}

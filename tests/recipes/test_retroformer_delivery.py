@@ -14,8 +14,9 @@ pytest.importorskip("peft")
 
 from safetensors.torch import load_file
 
+from eval.lessons import markdown
 from recipes.common import CONFIGS
-from recipes.retroformer_delivery import CONTROL, main, markdown
+from recipes.retroformer_delivery import CONTROL, main
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.toy_env import TOY
 from trainers.arguments import parse_config

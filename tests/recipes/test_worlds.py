@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("trl")
 pytest.importorskip("peft")
 
+from agentspec.records.log import RunLog
 from recipes import grpo_delivery, sft_warmup
 from recipes.common import CONFIGS
 from tests.tiny import tiny_model, tiny_tokenizer
 from trainers.audit import audit
-from trainers.runlog import RunLog
 
 WARMUPS = {
     "deliverybench": {

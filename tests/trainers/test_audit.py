@@ -19,6 +19,9 @@ from datasets import Dataset
 
 from agentspec.cli import main
 from agentspec.files import digest, file_digest
+from agentspec.records.completions import check_completion
+from agentspec.records.digests import differing, field_digests
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from benchmarks.edits import FILE_KINDS, KINDS, apply, edit
 from benchmarks.tamper import RUN, train
@@ -27,12 +30,10 @@ from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import _equal, audit, check_samples, check_sums, padding_rows
 from trainers.credit import CreditRule
-from trainers.digests import differing, field_digests
 from trainers.estimators import ESTIMATORS
-from trainers.provenance import check_completion, check_tokens
+from trainers.provenance import check_tokens
 from trainers.receipts import row_digest
 from trainers.rollouts import task_rows
-from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
 SUPO = {

@@ -10,11 +10,11 @@ import torch
 
 pytest.importorskip("trl")
 
+from agentspec.records.log import RunLog
 from tests.trainers.builders import call, episode
 from tests.trainers.test_resume import trainer
 from trainers.call_metrics import CallMetrics
 from trainers.micro_batches import collate
-from trainers.runlog import RunLog
 from trainers.sequences import Row, TrainFilter, build_sequences
 
 ACT, SUM = "reasoning.direct/act", "memory.summary/summarise"

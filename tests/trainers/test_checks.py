@@ -25,9 +25,9 @@ from trl import GRPOConfig
 from agentspec.cli.errors import is_expected
 from agentspec.declaration import Declaration
 from agentspec.registry import REGISTRY, Entry, SpecError
-from trainers.ahead import OURS
+from trainers.ahead import OURS, check_names
 from trainers.arguments import parse_config
-from trainers.checks import check_given, check_reporters, notes
+from trainers.checks import check_reporters, notes
 from trainers.config import ScaffoldConfig
 from trainers.fields import FIXED, REFUSED, USED, field_rules
 
@@ -195,8 +195,8 @@ def test_what_is_set_with_effect_is_accepted(tmp_path: Path) -> None:
 def test_naming_an_unread_field_is_refused_even_at_its_default(tmp_path: Path) -> None:
     """`temperature: 1.0` beside an agent at 0.7 would mislead; the default of a fixed field is harmless."""
     with pytest.raises(SpecError, match=r"c\.yaml: `temperature` is not read"):
-        check_given(["learning_rate", "temperature"], "c.yaml")
-    check_given(["scale_rewards", "learning_rate", "model"], "c.yaml")
+        check_names(["learning_rate", "temperature"], "c.yaml")
+    check_names(["scale_rewards", "learning_rate", "model"], "c.yaml")
     path = tmp_path / "c.yaml"
     path.write_text("use_cpu: true\nbf16: false\n")
     with pytest.raises(SpecError, match="command line: `max_tool_calling_iterations` is not read"):
@@ -291,3 +291,11 @@ def test_a_weight_that_is_no_number_is_refused(tmp_path: Path) -> None:
 def test_a_cap_below_1_is_told(tmp_path: Path) -> None:
     told = [n for n in notes(config(tmp_path, loss_type="cispo")) if "epsilon_high 0.2" in n]
     assert len(told) == 1 and not list(notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0)))
+
+
+def test_held_out_tasks_that_are_trained_on_are_told(tmp_path: Path) -> None:
+    """Of ten layouts, training tasks 0 to 7 are eight; seeds 20000 to 20009 are all ten."""
+    sizes = {"train_tasks": 8, "eval_tasks": 10, "environment": {"name": "minigrid", "options": {"suite": "paper"}}}
+    assert [n for n in notes(config(tmp_path, **sizes)) if "8 of 10 tasks of the test split" in n]
+    other = {"name": "minigrid", "options": {"suite": "practice"}}
+    assert not [n for n in notes(config(tmp_path, **{**sizes, "environment": other})) if "split" in n]

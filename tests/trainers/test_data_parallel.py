@@ -26,6 +26,7 @@ from safetensors.torch import load_file, save_file
 from transformers import TrainerCallback
 
 from agentspec.episode import Job
+from agentspec.records.log import RunLog
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
@@ -39,7 +40,6 @@ from trainers.distributed import leave_group
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import load_state
 from trainers.rollouts import collect, task_rows
-from trainers.runlog import RunLog
 
 ROOT = Path(__file__).resolve().parents[2]
 ROLLOUTS = 8

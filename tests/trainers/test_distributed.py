@@ -28,6 +28,7 @@ from accelerate.utils import DistributedType, FullyShardedDataParallelPlugin, pr
 from safetensors.torch import load_file, save_file
 from trl.distributed import DistributedBackend
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from tests.tiny import tiny_tokenizer
 from tests.trainers.builders import call, episode, instead_of_playing
@@ -37,7 +38,6 @@ from tests.trainers.test_supo import configured
 from trainers import grpo as grpo_module
 from trainers import policy_loss
 from trainers.distributed import check_layout, check_trained, keep_precision, leave_group
-from trainers.runlog import RunLog
 from trainers.tree import model as tree_model
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,6 +20,7 @@ from trl import GRPOTrainer
 from trl.generation.vllm_client import VLLMClient
 from trl.generation.vllm_generation import VLLMGeneration
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from rewards.base import REWARDS, RewardEntry
 from tests.tiny import tiny_model, tiny_tokenizer
@@ -28,7 +29,6 @@ from tests.trainers.fake_vllm import FakeVLLM, use_fake_vllm
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import audit
 from trainers.grpo import ScaffoldGRPOTrainer
-from trainers.runlog import RunLog
 from trainers.vllm import BATCH_INVARIANT, base_kept, importance_ratio, prepare_vllm
 
 

@@ -16,6 +16,7 @@ pytest.importorskip("peft")
 from peft import LoraConfig, get_peft_model
 from transformers import TrainerCallback
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.types import Sampling
 from benchmarks.exactness import make_batch, oracle_loss, relative_error, tiny_policy, trained_tokens
@@ -30,7 +31,6 @@ from trainers.config import ScaffoldConfig
 from trainers.finite import NonFiniteError, require_finite, without_dropout
 from trainers.forward import rows_logprobs
 from trainers.micro_batches import ROWS, collate
-from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
 

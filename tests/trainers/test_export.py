@@ -16,10 +16,10 @@ from transformers import AutoModelForCausalLM, AutoTokenizer
 
 from agentspec.files import file_digest
 from agentspec.llm.models import ModelNotFoundError
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from tests.tiny import tiny_model, tiny_tokenizer
 from trainers.export import MANIFEST, export, find_trained, reward_summary
-from trainers.runlog import RunLog
 
 TEXT = "go to pickup of order 3"
 

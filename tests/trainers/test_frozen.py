@@ -12,12 +12,12 @@ pytest.importorskip("trl")
 
 from agentspec.llm.base import Request, assistant, user
 from agentspec.llm.local import LocalLLM
+from agentspec.records.log import RunLog
 from agentspec.types import CallTag, Sampling
 from tests.tiny import tiny_model, tiny_tokenizer
 from tests.trainers.test_tree import forked_rows, gradients
 from trainers.forward import frozen_output, rows_logprobs
 from trainers.frozen import frozen_layers, layer_above
-from trainers.runlog import RunLog
 from trainers.sequences import Row, TokenSequence
 from trainers.tree.model import enable_tree
 

@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("trl")
 
+from agentspec.records.log import RunLog
 from agentspec.trajectory import Trajectory, read_trajectories
 from agentspec.types import Task
 from tests.toy_env import ToyEnv
 from tests.trainers.played import toy_tasks, toy_trainer
 from trainers.audit import audit
-from trainers.runlog import RunLog
 
 TASKS, GROUP = 4, 4
 MESSAGES = {

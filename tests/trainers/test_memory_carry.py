@@ -14,6 +14,8 @@ from datasets import Dataset
 from agentspec.carry import FILE, MemoryBank, save_bank, start_bank
 from agentspec.episode import Job
 from agentspec.files import digest
+from agentspec.records.folder import last_complete_checkpoint
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 from agentspec.types import Task
@@ -26,8 +28,6 @@ from trainers.credit import ScoredEpisode
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.retroformer import as_retroformer
 from trainers.rollouts import rollout_jobs, starting_states, task_rows
-from trainers.run_folder import last_complete_checkpoint
-from trainers.runlog import RunLog
 
 TASKS = [Task(TOY, seed, {"steps": 3, "menu": True}) for seed in range(2)]
 AGENT: dict[str, Any] = {

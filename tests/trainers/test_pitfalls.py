@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 pytest.importorskip("trl")
 
 
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.types import Completion
 from rewards import RewardSet
@@ -26,7 +27,6 @@ from tests.trainers.test_supo import configured, credited, played
 from trainers.checks import notes
 from trainers.losses import LOSSES
 from trainers.micro_batches import collate, padding_row, partition
-from trainers.runlog import RunLog
 from trainers.sequences import Row, TokenSequence
 
 COVERED = {

@@ -32,6 +32,7 @@ from agentspec.llm.local import LocalLLM
 from agentspec.llm.local.sampling import filter_top
 from agentspec.llm.models import resolve
 from agentspec.llm.vllm import trl_backend
+from agentspec.records.log import RunLog
 from agentspec.trajectory import read_trajectories
 from agentspec.types import Completion, Sampling
 from rewards.base import REWARDS, RewardEntry
@@ -43,7 +44,6 @@ from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.policy import load_policy
 from trainers.rollouts import task_rows
-from trainers.runlog import RunLog
 
 pytestmark = pytest.mark.slow
 

@@ -16,6 +16,8 @@ pytest.importorskip("trl")
 from datasets import Dataset
 
 from agentspec.files import file_digest
+from agentspec.records.folder import LOCK, checkpoints, last_complete_checkpoint
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.types import Task
 from tests.tiny import tiny_model, tiny_tokenizer
@@ -26,8 +28,6 @@ from trainers.config import ScaffoldConfig
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import ScaffoldState, load_state, save_state
 from trainers.rollouts import task_rows
-from trainers.run_folder import LOCK, checkpoints, last_complete_checkpoint
-from trainers.runlog import RunLog
 from trainers.sequences import Row, build_sequences
 
 

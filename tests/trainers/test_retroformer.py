@@ -17,6 +17,7 @@ from datasets import Dataset
 from peft import LoraConfig, get_peft_model
 
 from agentspec.episode import Job
+from agentspec.records.log import RunLog
 from agentspec.reflection.retroformer import PATH
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory, read_trajectories
@@ -33,7 +34,6 @@ from trainers.forward import rows_logprobs
 from trainers.policy import ACTOR, TRAINED, load_actor_and_reflector, load_policy
 from trainers.retroformer import RetroformerTrainer, as_retroformer, play_trials
 from trainers.rollouts import task_rows
-from trainers.runlog import RunLog
 from trainers.sequences import Row, TrainFilter, build_sequences
 
 AGENT = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.trainers.builders import call, episode
-from trainers.sequences import TrainFilter, build_sequences, unmatched_patterns
+from trainers.sequences import TrainFilter, build_sequences
 
 
 def test_append_only_calls_share_one_sequence() -> None:
@@ -65,10 +65,3 @@ def test_missing_logprobs_are_refused() -> None:
     c = replace(c, completions=(replace(c.completions[0], logprobs=()),))
     with pytest.raises(ValueError, match="log-probabilities"):
         build_sequences(episode([c]))
-
-
-def test_patterns() -> None:
-    paths = ["reasoning.react/think", "reasoning.react/act", "memory.summary/summarise"]
-    assert unmatched_patterns(paths, TrainFilter(("reasoning.*", "memory.summary"))) == []
-    assert unmatched_patterns(paths, TrainFilter(("reasoning.react/ack",))) == ["reasoning.react/ack"]
-    assert unmatched_patterns(paths, TrainFilter(("reflection.*",))) == ["reflection.*"]

@@ -14,6 +14,7 @@ pytest.importorskip("trl")
 from agentspec.episode import Job, Runner
 from agentspec.llm.base import Request
 from agentspec.llm.scripted import ScriptedLLM
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.trajectory import Trajectory
@@ -27,9 +28,8 @@ from trainers.audit import audit
 from trainers.call_metrics import truncated_calls
 from trainers.config import ScaffoldConfig
 from trainers.credit import Credited, is_overlong
-from trainers.runlog import RunLog
+from trainers.presets import as_supo
 from trainers.sequences import build_sequences
-from trainers.supo import as_supo
 
 SUPO = {
     "agent": {"reasoning": "direct", "memory": {"name": "summary", "every": 3}},

@@ -16,6 +16,7 @@ from datasets import Dataset
 from safetensors.torch import load_file
 
 from agentspec.episode import Job, Runner
+from agentspec.records.log import RunLog
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
@@ -26,7 +27,6 @@ from tests.trainers.test_resume import trainer, weights
 from trainers.config import ScaffoldConfig
 from trainers.credit import ScoredEpisode
 from trainers.rollouts import task_rows
-from trainers.runlog import RunLog
 from trainers.validation import validate, validation_scaffolds
 
 HELD_OUT = [Task(TOY, 10_000 + i, {"steps": 3, "menu": True}, "validation") for i in range(4)]

@@ -14,6 +14,7 @@ pytest.importorskip("trl")
 
 from agentspec.episode import Job, Runner
 from agentspec.llm.base import Request
+from agentspec.llm.replayed import ReplayedLLM
 from agentspec.llm.scripted import ScriptedLLM
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.spec import AgentSpec
@@ -25,7 +26,7 @@ from tests.toy_env import TOY
 from tests.trainers.builders import call, episode
 from tests.trainers.played import toy_trainer
 from trainers.audit import audit
-from trainers.counterfactuals import FOLDER, Replayed, attach, differences, play_beside, records
+from trainers.counterfactuals import FOLDER, attach, differences, play_beside, records
 from trainers.credit import CreditRule, Outcome, ScoredEpisode
 from trainers.estimators import centred, grpo
 from trainers.sequences import TrainFilter
@@ -335,7 +336,7 @@ def test_helpers_answers_are_not_played_again(tmp_path: Path) -> None:
 
 def test_a_replayed_backend_is_a_whole_backend() -> None:
     live = Reader()
-    replayed = Replayed(live, episode([], [0.0]), Plan(1, kept=True), lambda path: False)
+    replayed = ReplayedLLM(live, (), step=1, withheld=lambda request: False, seeds=(0,), suffix="~1")
     assert (replayed.name, replayed.max_context) == (live.name, live.max_context)
     assert replayed.capabilities == live.capabilities and replayed.count_tokens("12345678") == 3
     assert asyncio.run(replayed.score((), ["ab"], episode="e")) == (-2.0,)

@@ -22,7 +22,8 @@ from agentspec.envs.alfred.listing import in_view, worded
 from agentspec.envs.alfred.own import TASKS, own_trial
 from agentspec.envs.alfred.staging import SETTINGS, set_up
 from agentspec.envs.alfred.trials import PAPER, Trial, read_trial, trial_path
-from agentspec.envs.thor.game import Game, Told, check, check_folders, check_index
+from agentspec.envs.shared import check
+from agentspec.envs.thor.game import Game, Told, check_folders, check_index
 from agentspec.envs.thor.homes import room
 from agentspec.envs.thor.mining import household
 from agentspec.envs.thor.names import Names
@@ -36,7 +37,8 @@ RULES = """You act in a room of a house, one action at a time. Only objects with
 used; you see them listed. Moves are 0.25 m, turns 90 degrees, the camera looks up or down by 15 degrees.
 - You can hold one object. Closed containers hide what is in them; open them first.
 - Heat: put it into the microwave, close it, turn it on. Cool: put it into the fridge and close it. Clean: put it into \
-the sink basin and turn the faucet on. Slice: hold a knife.
+the sink basin and turn the faucet on. Slice: hold a knife. Look at it in the light: hold it and turn the lamp on, \
+with the lamp in view.
 - You have {steps} steps; fewer steps are better. {stop}
 Your task: {task}"""
 
@@ -84,6 +86,15 @@ class AlfredEnv(Game):
         "rule_based": "agentspec.envs.alfred.expert:expert",
         "random": "agentspec.envs.alfred.expert:luck",
     }
+
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int | None:
+        """How many there are under these options: the paper's seven, one `task` or file; of ours one for each seed."""
+        if options.get("trial_file"):
+            return 1
+        if options.get("suite", "own") == "own":
+            return None if options.get("task", -1) < 0 else 1
+        return len(PAPER) if options.get("task", -1) < 0 else 1
 
     def __init__(
         self,

@@ -8,13 +8,13 @@ demonstrator of warm starts, not a fair opponent.
 from __future__ import annotations
 
 import inspect
-import json
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from agentspec.envs.alfred.env import AlfredEnv
 from agentspec.envs.alfred.menu import ON_OBJECT, PHRASES, PLAIN
+from agentspec.envs.experts import Chance
 from agentspec.envs.thor.kinds import KNIVES, piece
 from agentspec.envs.thor.state import Body
 from agentspec.envs.thor.ways import way_to_see
@@ -237,32 +237,6 @@ def expert_steps(seed: int) -> int:
     return env.steps
 
 
-class Chance:
-    """Uniform draws from the menu, or of native actions on things in view."""
-
-    def __init__(self, rng: random.Random) -> None:
-        self._rng = rng
-
-    def act(self, info: Mapping[str, Any]) -> str:
-        """A random action."""
-        choices = [c for c in info["action_schema"].choices if c != "stop"]
-        if choices:
-            return self._rng.choice(choices)
-        texts = [f"{name}()" for name in PLAIN]
-        texts += [f'{call}("{o["name"]}")' for o in info["state"]["visible"] for call in ON_OBJECT]
-        return self._rng.choice(texts)
-
-    def snapshot(self) -> bytes:
-        """The generator's state."""
-        version, numbers, gauss = self._rng.getstate()
-        return json.dumps([version, list(numbers), gauss]).encode()
-
-    def restore(self, blob: bytes) -> None:
-        """Go back to a `snapshot`."""
-        version, numbers, gauss = json.loads(blob)
-        self._rng.setstate((version, tuple(numbers), gauss))
-
-
 def expert(options: Mapping[str, Any], rng: random.Random) -> Expert:
     """The player `rule_based`."""
     return Expert(options)
@@ -270,7 +244,16 @@ def expert(options: Mapping[str, Any], rng: random.Random) -> Expert:
 
 def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
     """The player `random`."""
-    return Chance(rng)
+    return Chance(rng, _offered)
 
 
-__all__ = ["Chance", "Expert", "expert", "expert_steps", "luck", "subgoal"]
+def _offered(info: Mapping[str, Any]) -> Sequence[str]:
+    """The menu without its end, or native actions, also on things in view."""
+    if choices := [c for c in info["action_schema"].choices if c != "stop"]:
+        return choices
+    texts = [f"{name}()" for name in PLAIN]
+    texts += [f'{call}("{o["name"]}")' for o in info["state"]["visible"] for call in ON_OBJECT]
+    return texts
+
+
+__all__ = ["Expert", "expert", "expert_steps", "luck", "subgoal"]

@@ -14,7 +14,6 @@ pickles of an environment rest on them.
 from __future__ import annotations
 
 import json
-import re
 import string
 from collections.abc import Mapping
 from dataclasses import replace
@@ -39,6 +38,7 @@ from agentspec.envs.deliverybench.world.events import Progress, events_since
 from agentspec.envs.deliverybench.world.grammar import advertised, understood
 from agentspec.envs.deliverybench.world.rules import Rules, rules_named
 from agentspec.envs.deliverybench.world.thinking import ThinkTime
+from agentspec.envs.shared import check, printable
 from agentspec.metrics import Metric
 from agentspec.shapes import plan_of
 from agentspec.types import ActionError, ActionSchema
@@ -111,11 +111,11 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         render_mode: str | None = None,
         images: bool = False,
     ) -> None:
-        _check("observation", observation, ("full", "compact"))
-        _check("action_mode", action_mode, ("native", "menu"))
-        _check("render_mode", render_mode, (None, "rgb_array"))
+        check("observation", observation, ("full", "compact"))
+        check("action_mode", action_mode, ("native", "menu"))
+        check("render_mode", render_mode, (None, "rgb_array"))
         if isinstance(order_seed, str):
-            _check("order_seed", order_seed, ("seed", "original"))
+            check("order_seed", order_seed, ("seed", "original"))
         if not 0 < shift_hours < float("inf"):
             raise ValueError(f"shift_hours is {shift_hours}; expected a number above 0")
         if max_steps is not None and not 1 <= max_steps <= STEP_LIMIT:
@@ -233,7 +233,7 @@ class DeliveryBenchEnv(gymnasium.Env[Observation, str]):
         world, last = self.world, last or self._last
         view = self._view()
         self._menu = self._options(view)
-        observation: Observation = {"text": _printable(self._text(view))}
+        observation: Observation = {"text": printable(self._text(view), CHARSET)[:MAX_TEXT]}
         if self.images:
             observation["image"] = self._picture()
         schema = replace(advertised(world.schema), choices=tuple(self._menu))
@@ -413,16 +413,3 @@ def _adapted(rules: Rules, max_steps: int | None, start_battery: float | None) -
     if not 0.0 <= start_battery <= 100.0:
         raise ValueError(f"start_battery is {start_battery}; expected percent, 0 to 100")
     return replace(rules, initial_battery=float(start_battery))
-
-
-def _check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
-
-
-_UNPRINTABLE = re.compile(f"[^{re.escape(CHARSET)}]")
-
-
-def _printable(text: str) -> str:
-    # Messages quote what the agent wrote; the text space holds printable ASCII only.
-    return _UNPRINTABLE.sub("?", text)[:MAX_TEXT]

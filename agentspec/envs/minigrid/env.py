@@ -12,7 +12,6 @@ found by breadth-first search when the first episode on a layout succeeds.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -25,9 +24,10 @@ from gymnasium import spaces
 
 from agentspec.actions import parse_action
 from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum
-from agentspec.envs.minigrid.suites import Layout, layout_of
+from agentspec.envs.minigrid.suites import PAPER, Layout, layout_of
 from agentspec.envs.minigrid.texts import TEXTS, compact
 from agentspec.envs.minigrid.view import Thing, View, look
+from agentspec.envs.shared import ASCII, check, printable
 from agentspec.metrics import Metric
 from agentspec.types import ActionError, ActionSchema, ActionSpec
 
@@ -78,6 +78,11 @@ view. Distances are in cells from you: "2 forward, 1 left" is two cells ahead an
 - "get to the goal": walk onto it; done is not needed.
 - You have {steps} steps; fewer steps are better."""
 
+MATCHING = """
+- "the matching object": two objects stand at the end of the hallway; go next to the one that equals the object in the \
+small room at the hallway's other end. Going next to the other one fails."""
+"""A rule of the levels whose mission names an object that is to be seen first."""
+
 
 class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
     """One grid, one mission.
@@ -112,6 +117,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         "random": "agentspec.envs.minigrid.expert:luck",
     }
 
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int | None:
+        """How many there are under these options: ten in the suite `paper`, one for a `task`, else one a seed."""
+        if options.get("task"):
+            return 1
+        return None if options.get("level") or options.get("suite", "paper") != "paper" else len(PAPER)
+
     def __init__(
         self,
         *,
@@ -127,9 +139,9 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         if not (suite or level or task):
             suite = "paper"
         layout_of(suite=suite, level=level, task=task)
-        _check("observation", observation, tuple(TEXTS))
-        _check("action_mode", action_mode, ("native", "menu"))
-        _check("render_mode", render_mode, (None, "rgb_array"))
+        check("observation", observation, tuple(TEXTS))
+        check("action_mode", action_mode, ("native", "menu"))
+        check("render_mode", render_mode, (None, "rgb_array"))
         if max_steps < 1:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
         self._choice = {"suite": suite, "level": level, "task": task}
@@ -139,9 +151,9 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         self.render_mode = render_mode
         self.action_schema = _schema(menu=action_mode == "menu", count=actions_of(level) if level else len(ACTIONS))
         answer = "The actions are: " + ", ".join(self.action_schema.choices) if self.action_schema.choices else ""
-        self.instruction = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
+        self._rules = "\n".join(p for p in (RULES.format(steps=max_steps), answer) if p)
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
-        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=10_000, charset=_CHARSET)}
+        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=10_000, charset=ASCII)}
         if images:
             shown["image"] = spaces.Box(0, 255, (7 * TILE, 7 * TILE, 3), np.uint8)
         self.observation_space = spaces.Dict(shown)
@@ -201,7 +213,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         world, last = self.world, self._last
         # A model that writes no action needs few words more than that; the whole error stands in `info`.
         said = last.message or ("that was no action" if self._word is compact and last.error else last.error)
-        observation: dict[str, Any] = {"text": _printable(self._word(self._view, said))}
+        observation: dict[str, Any] = {"text": printable(self._word(self._view, said))}
         if self.images:
             observation["image"] = world.get_pov_render(tile_size=TILE)
         return observation, self._info(self._view)
@@ -256,6 +268,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         for number in todo:
             self._act(number)
         self._last = last
+
+    @property
+    def instruction(self) -> str:
+        """Rules of the game, and of the level where it has one of its own."""
+        first, _, steps = self._rules.partition("\n- You have")
+        matching = MATCHING if self.layout is not None and "Memory" in self.layout.id else ""
+        return f"{first}{matching}\n- You have{steps}"
 
     # -- internals ---------------------------------------------------------------------------------------------
 
@@ -378,20 +397,6 @@ def _toggled(ahead: Thing | None, now: Thing | None) -> str:
     if now is not None and now.name == ahead.name:
         return f"toggled {ahead.name}, nothing changed"
     return f"toggled {ahead.name}, now {now.name if now else 'nothing'} is in front"
-
-
-def _check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
-
-
-_CHARSET = "".join(chr(c) for c in range(32, 127)) + "\n"
-_OTHER = re.compile(r"[^ -~\n]")
-
-
-def _printable(text: str) -> str:
-    # Messages quote what the agent wrote; the text space holds printable ASCII only.
-    return _OTHER.sub("?", text)
 
 
 assert len(CALLS) == len(ACTIONS)

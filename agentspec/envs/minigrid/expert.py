@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import minigrid  # noqa: F401  (registers its environments)
 
+from agentspec.envs.experts import Chance
 from agentspec.envs.minigrid.env import CALLS, NO_ACTION
 from agentspec.envs.minigrid.search import shortest_plan
 
@@ -81,28 +82,6 @@ def _turns_to_see(world: Any) -> list[int]:
         world.agent_dir = heading
 
 
-class Chance:
-    """Any of the seven actions."""
-
-    def __init__(self, rng: random.Random) -> None:
-        self._rng = rng
-
-    def act(self, info: Mapping[str, Any]) -> str:
-        """A random action."""
-        schema = info["action_schema"]
-        return self._rng.choice(schema.choices or [f"{name}()" for name in schema.actions])
-
-    def snapshot(self) -> bytes:
-        """The generator's state."""
-        version, numbers, gauss = self._rng.getstate()
-        return json.dumps([version, list(numbers), gauss]).encode()
-
-    def restore(self, blob: bytes) -> None:
-        """Go back to a `snapshot`."""
-        version, numbers, gauss = json.loads(blob)
-        self._rng.setstate((version, tuple(numbers), gauss))
-
-
 def expert(
     options: Mapping[str, Any], rng: random.Random, most_states: int = 200_000, look: bool | None = None
 ) -> ShortestPlan:
@@ -112,4 +91,10 @@ def expert(
 
 def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
     """The player `random`."""
-    return Chance(rng)
+    return Chance(rng, _offered)
+
+
+def _offered(info: Mapping[str, Any]) -> Sequence[str]:
+    """Any of the seven actions."""
+    schema = info["action_schema"]
+    return schema.choices or [f"{name}()" for name in schema.actions]

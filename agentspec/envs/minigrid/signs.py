@@ -6,15 +6,31 @@ import json
 from collections.abc import Iterator
 
 from agentspec.envs.minigrid.view import AHEAD, HEADINGS
-from agentspec.failures import Sign, in_a_row, revisits
+from agentspec.failures import Sign, in_a_row, in_vain_again, revisits
 from agentspec.trajectory import Trajectory
+from agentspec.types import Transition
 
 NOTHING = ("toggled nothing", "picked up nothing", "dropped nothing")
+MOVED = ("turned ", "went forward", "could not go forward")
+"""How the messages of moves begin."""
 
 
 def signs(trajectory: Trajectory) -> list[Sign]:
     """Signs of an episode."""
-    return [*_moves(trajectory), *_nothing(trajectory), *_end(trajectory)]
+    again = in_vain_again(trajectory.transitions, _in_vain)
+    return [*_moves(trajectory), *_nothing(trajectory), *again, *_locked(trajectory), *_end(trajectory)]
+
+
+def _in_vain(t: Transition) -> bool:
+    message = str(t.info.get("message", ""))
+    return message in NOTHING or message.startswith("could not") or message.endswith("nothing changed")
+
+
+def _locked(trajectory: Trajectory) -> Iterator[Sign]:
+    for t in trajectory.transitions:
+        message = str(t.info.get("message", ""))
+        if message.startswith("toggled locked") and message.endswith("nothing changed"):
+            yield Sign("understanding/knowledge/rule_unfamiliar", t.step, f"{message}: it needs the key, carried")
 
 
 def _moves(trajectory: Trajectory) -> Iterator[Sign]:
@@ -27,7 +43,11 @@ def _moves(trajectory: Trajectory) -> Iterator[Sign]:
     views = [{k: v for k, v in t.input.state.items() if k not in ("steps_left", "history")} for t in steps]
     seen = [json.dumps([place, view], sort_keys=True) for place, view in zip(_places(trajectory), views, strict=True)]
     for i in revisits([(there, t.action_text) for there, t in zip(seen, steps, strict=True)]):
-        yield Sign("grounding/spatial/stuck", steps[i].step, "the same action at the same place a third time or more")
+        if messages[i].startswith(MOVED):
+            yield Sign("grounding/spatial/stuck", steps[i].step, "the same move at the same place a third time or more")
+    nowhere = len({*_places(trajectory)}) <= 2 and 2 * sum(map(_in_vain, steps)) < len(steps)
+    if steps and steps[-1].truncated and not trajectory.metrics.get("success") and nowhere:
+        yield Sign("understanding/knowledge/strategy", steps[-1].step, "moved about on two cells at most in all steps")
 
 
 def _places(trajectory: Trajectory) -> list[tuple[int, int]]:

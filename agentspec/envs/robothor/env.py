@@ -16,10 +16,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from agentspec.envs.robothor.episodes import VALIDATION, Episode, own_episodes, read_episodes, scene_of
+from agentspec.envs.robothor.episodes import OWN, VALIDATION, Episode, own_episodes, read_episodes, scene_of
 from agentspec.envs.robothor.presets import PRESETS
+from agentspec.envs.shared import check, come_nearer
 from agentspec.envs.thor import homes, mining
-from agentspec.envs.thor.game import Game, Told, check, check_folders
+from agentspec.envs.thor.game import Game, Told, check_folders
 from agentspec.envs.thor.names import Names, direction, whereabouts, words
 from agentspec.envs.thor.protocol import Event
 from agentspec.envs.thor.scene import Scene
@@ -82,6 +83,13 @@ class RoboThorEnv(Game):
         "rule_based": "agentspec.envs.robothor.expert:expert",
         "random": "agentspec.envs.robothor.expert:luck",
     }
+
+    @staticmethod
+    def episodes(options: Mapping[str, Any]) -> int:
+        """How many there are under these options: those of the suite, or one `episode`."""
+        if options.get("episode"):
+            return 1
+        return len(OWN if options.get("suite", "own") == "own" else VALIDATION)
 
     def __init__(
         self,
@@ -169,7 +177,7 @@ class RoboThorEnv(Game):
         moved = math.hypot(now["x"] - at["x"], now["z"] - at["z"])
         self.walked += moved
         if self.level is not None and self.left_to_go is not None:
-            self.level -= max(-moved, min(moved, self.level - self.left_to_go))
+            self.level -= come_nearer(self.level, self.left_to_go, moved)
         if call == "STOP":
             self.stopped, self.won = True, self._in_view()
         # A blocked move is an action like any other, which the fixed menu offers: it only takes a step.
@@ -192,8 +200,7 @@ class RoboThorEnv(Game):
     def _nearer(self) -> float:
         """Metres come nearer since the start over the shortest path's length (at least 1 m).
 
-        `level`, the metres that are paid for, follows the distance by no more than a step moves. So no loop earns
-        anything, whatever the distance jumps.
+        `level`, the metres that are paid for, follows the distance (`agentspec.envs.shared.come_nearer`).
         """
         if self.far is None or self.level is None:
             return 0.0

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from agentspec.envs.experts import Chance
 from agentspec.envs.robothor.env import CALLS, RoboThorEnv
 from agentspec.envs.thor.scene import cell_at
 
@@ -97,27 +98,6 @@ class Oracle:
         self._plan, self._due = list(plan), tuple(due)
 
 
-class Chance:
-    """Uniform draws from the actions, stop among them."""
-
-    def __init__(self, rng: random.Random) -> None:
-        self._rng = rng
-
-    def act(self, info: Mapping[str, Any]) -> str:
-        """A random action."""
-        return self._rng.choice(list(info["action_schema"].choices) or [f"{call}()" for call in CALLS])
-
-    def snapshot(self) -> bytes:
-        """The generator's state."""
-        version, numbers, gauss = self._rng.getstate()
-        return json.dumps([version, list(numbers), gauss]).encode()
-
-    def restore(self, blob: bytes) -> None:
-        """Go back to a `snapshot`."""
-        version, numbers, gauss = json.loads(blob)
-        self._rng.setstate((version, tuple(numbers), gauss))
-
-
 def expert(options: Mapping[str, Any], rng: random.Random) -> Oracle:
     """The player `rule_based`."""
     return Oracle(options)
@@ -125,4 +105,4 @@ def expert(options: Mapping[str, Any], rng: random.Random) -> Oracle:
 
 def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
     """The player `random`."""
-    return Chance(rng)
+    return Chance(rng, lambda info: info["action_schema"].choices or [f"{call}()" for call in CALLS])

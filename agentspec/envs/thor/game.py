@@ -8,7 +8,6 @@ from; a text that is no action takes one step.
 from __future__ import annotations
 
 import json
-import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
+from agentspec.envs.shared import ASCII, check, printable
 from agentspec.envs.thor.engine import OfflineThor, Settings
 from agentspec.envs.thor.mining import NoData
 from agentspec.envs.thor.protocol import Event, Thor
@@ -29,9 +29,6 @@ from agentspec.types import Action, ActionError, ActionSchema
 
 MAX_ACTION = 256
 SNAPSHOT_VERSION = 1
-
-_CHARSET = "".join(chr(c) for c in range(32, 127)) + "\n"
-_OTHER = re.compile(r"[^ -~\n]")
 
 
 @dataclass
@@ -79,7 +76,7 @@ class Game(gymnasium.Env[dict[str, Any], str]):
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
         self.max_steps, self.images, self.render_mode = max_steps, images, render_mode
         self.action_space = spaces.Text(max_length=MAX_ACTION, min_length=0)
-        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=20_000, charset=_CHARSET)}
+        shown: dict[str, spaces.Space[Any]] = {"text": spaces.Text(max_length=20_000, charset=ASCII)}
         if images:
             shown["image"] = spaces.Box(0, 255, (settings.height, settings.width, 3), np.uint8)
         self.observation_space = spaces.Dict(shown)
@@ -196,7 +193,7 @@ class Game(gymnasium.Env[dict[str, Any], str]):
         """The current observation and info, without stepping (after `restore`, say)."""
         self._running()
         told = self._describe()
-        observation: dict[str, Any] = {"text": _OTHER.sub("?", told.pop("text"))}
+        observation: dict[str, Any] = {"text": printable(told.pop("text"))}
         if self.images:
             observation["image"] = self.world.observe().frame
         last = self.told
@@ -261,16 +258,6 @@ class Game(gymnasium.Env[dict[str, Any], str]):
     def _running(self) -> None:
         if self.episode_seed is None:
             raise gymnasium.error.ResetNeeded("call reset() before anything else")
-
-
-def check(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    """Refuse a value that is not among the allowed ones.
-
-    Raises:
-        ValueError: it is not.
-    """
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}; expected one of {', '.join(repr(a) for a in allowed)}")
 
 
 def check_index(name: str, value: int, least: int, most: int | None) -> None:

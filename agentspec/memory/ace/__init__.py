@@ -155,19 +155,21 @@ class ACE:
         self._waiting.due = bool(self._waiting.steps)
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        """The playbook by sections, its best bullets mattering most, and the last review."""
+        """The playbook by sections, its best bullets (of equals the newest) mattering most, and the last review."""
         if self._waiting.due:
             self._waiting.due = False
-            await self._adapt(input.instruction)
+            await self._adapt()
         source = self.services.llm.module
         shown = self.playbook.ordered()
         if k:
             best = sorted(shown, key=lambda b: (-b.balance, -b.number))[:k]
             shown = [b for b in shown if b in best]
-        items = [RecallItem(b.line(), float(b.balance), "procedural", source, b.balance) for b in shown]
+        worth = {b.id: i for i, b in enumerate(sorted(shown, key=lambda b: (b.balance, b.number)))}
+        items = [RecallItem(b.line(), float(b.balance), "procedural", source, worth[b.id]) for b in shown]
         head = [RecallItem(prompts.HEADER, kind="procedural", source=source, priority=math.inf)] if items else []
-        last = [RecallItem(prompts.LAST.format(text=self._last), kind="summary", source=source)] if self._last else []
-        return Recall((*head, *items, *last))
+        last = prompts.LAST.format(text=self._last)
+        said = [RecallItem(last, kind="summary", source=source, priority=math.inf)] if self._last else []
+        return Recall((*head, *items, *said))
 
     async def store(self, transition: Transition) -> None:
         waiting = self._waiting
@@ -177,8 +179,9 @@ class ACE:
         waiting.steps = [*waiting.steps, block + named][-self._most_waiting :]
         waiting.cited = list(dict.fromkeys([*waiting.cited, *cited]))
         waiting.since += 1
+        waiting.task = transition.input.instruction
         if self.every and waiting.since >= self.every and not (transition.terminated or transition.truncated):
-            await self._adapt(transition.input.instruction, transition.next_text)
+            await self._adapt(transition.next_text)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is reflected on with the outcome when the next episode of the run begins."""
@@ -193,17 +196,17 @@ class ACE:
 
     # -- reflector and curator -------------------------------------------------------------------------------------
 
-    async def _adapt(self, instruction: str, next_text: str = "") -> None:
+    async def _adapt(self, next_text: str = "") -> None:
         """Reflect on the steps that wait, then curate if it is time to."""
         self._waiting.since = 0
-        task = clip_text(instruction.strip(), self.task_tokens, self._count) or "(not told)"
+        task = clip_text(self._waiting.task.strip(), self.task_tokens, self._count) or "(not told)"
         review = await self._reflect(task, next_text)
         if review is None:
             return
         self._counts.reviews += 1
         self._last = clip_text(review.correct or review.insight, self.bullet_tokens, self._count)
         for verdict in review.bullets:
-            self.playbook.tag(verdict.id, verdict.tag)
+            self.playbook.tag(verdict.id, verdict.tag.strip().lower())
         waiting = self._waiting
         waiting.reviews = [*waiting.reviews, review.text()][-2 * self.curate_every :]
         waiting.steps, waiting.cited = [], []
@@ -217,7 +220,8 @@ class ACE:
         steps = f"{telling.STEPS}\n{telling.numbered(self._waiting.steps)}"
         state = excerpt(next_text, self.step_tokens, self._count)
         now = [prompts.NOW.format(state=state)] if state else []
-        parts = [*([head] if shown else []), steps, *now, prompts.REVIEW]
+        review_it = prompts.REVIEW.format(words=self.answer_tokens // 2)
+        parts = [*([head] if shown else []), steps, *now, review_it]
         prompt = _prompt(prompts.REFLECTOR.format(task=task), parts)
         answer = await self.services.ask("reflect", prompt, self.answer_tokens, json_of(Review, repairs=self.repairs))
         review: Review | None = answer.value
@@ -230,7 +234,8 @@ class ACE:
             count=len(bullets), used=used, budget=self.playbook_tokens, bullets=_lines(bullets) or "(empty)"
         )
         reviews = prompts.REVIEWS.format(reviews="\n".join(f"- {text}" for text in self._waiting.reviews))
-        parts = [playbook, reviews, prompts.DELTAS.format(most=MOST_OPERATIONS)]
+        deltas = prompts.DELTAS.format(most=MOST_OPERATIONS, words=self.answer_tokens // 2)
+        parts = [playbook, reviews, deltas]
         prompt = _prompt(prompts.CURATOR.format(task=task, sections='" or "'.join(SECTIONS)), parts)
         parse = json_of({"operations": list}, repairs=self.repairs)
         answer = await self.services.ask("curate", prompt, self.answer_tokens, parse)

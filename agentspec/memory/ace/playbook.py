@@ -20,8 +20,6 @@ SECTIONS = {"STRATEGIES": "str", "MISTAKES": "mis", "FACTS": "fac", "OTHERS": "o
 OTHERS = "OTHERS"
 _CITED = re.compile(rf"\b(?:{'|'.join(SECTIONS.values())})-\d{{5,}}\b")
 
-Tag = Literal["helpful", "harmful", "neutral"]
-
 
 @dataclass(frozen=True)
 class Bullet(Record):
@@ -86,12 +84,11 @@ class Playbook:
         """Ids of bullets that a text names, in order, each once."""
         return [id for id in dict.fromkeys(_CITED.findall(text)) if id in self._bullets]
 
-    def tag(self, id: str, tag: Tag) -> bool:
-        """Count a verdict on a bullet; whether there is such a bullet."""
-        bullet = self._bullets.get(id)
-        if bullet is not None:
-            more = {tag: getattr(bullet, tag) + 1} if tag != "neutral" else {}
-            self._bullets[id] = replace(bullet, **more)
+    def tag(self, id: str, tag: str) -> bool:
+        """Count a verdict (`helpful`, `harmful` or `neutral`) on a bullet; whether there is such a bullet."""
+        bullet = self._bullets.get(id_of(id))
+        if bullet is not None and tag in ("helpful", "harmful"):
+            self._bullets[bullet.id] = replace(bullet, **{tag: getattr(bullet, tag) + 1})
         return bullet is not None
 
     def apply(self, operation: Operation, new_number: Callable[[], int]) -> Bullet | None:
@@ -110,19 +107,21 @@ class Playbook:
             return self._add(operation.section, text, new_number) if text else None
         if operation.type == "MERGE":
             return self.merge(operation.ids, text) if text else None
-        if operation.id not in self._bullets:
+        id = id_of(operation.id)
+        if id not in self._bullets:
             return None
         if operation.type == "REMOVE":
-            del self._bullets[operation.id]
+            del self._bullets[id]
             return None
         if not text:
             return None
-        self._bullets[operation.id] = replace(self._bullets[operation.id], text=text)
-        return self._bullets[operation.id]
+        self._bullets[id] = replace(self._bullets[id], text=text)
+        return self._bullets[id]
 
     def merge(self, ids: Sequence[str], text: str) -> Bullet | None:
         """One bullet of several: the oldest one's place and id, `text`, and the sums of the counters."""
-        found = sorted((self._bullets[id] for id in dict.fromkeys(ids) if id in self._bullets), key=lambda b: b.number)
+        named = dict.fromkeys(map(id_of, ids))
+        found = sorted((self._bullets[id] for id in named if id in self._bullets), key=lambda b: b.number)
         if len(found) < 2:
             return None
         kept = replace(
@@ -164,6 +163,16 @@ class Playbook:
         bullet = Bullet(new_number(), section_of(section), text)
         self._bullets[bullet.id] = bullet
         return bullet
+
+
+def id_of(name: str) -> str:
+    """The id in a name: models copy the brackets that it is shown in.
+
+    >>> id_of("[str-00012]"), id_of("str-00012"), id_of("none")
+    ('str-00012', 'str-00012', 'none')
+    """
+    found = _CITED.search(name)
+    return found[0] if found else name
 
 
 def section_of(name: str) -> str:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from agentspec.memory.ace.playbook import Tag
-
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the reflector says of one bullet."""
+    """What the reflector says of one bullet; a tag that is none of the three says nothing."""
 
     id: str
-    tag: Tag
+    tag: str
 
 
 @dataclass(frozen=True)
@@ -44,10 +42,12 @@ class Counts:
 
 @dataclass
 class Waiting:
-    """Steps to be reflected on, what they cited, how many steps since the last reflection, reviews to be curated."""
+    """Steps to be reflected on with the instruction they followed, what they cited, how many steps since the last
+    reflection, reviews to be curated."""
 
     steps: list[str] = field(default_factory=list)
     cited: list[str] = field(default_factory=list)
     since: int = 0
     reviews: list[str] = field(default_factory=list)
     due: bool = False
+    task: str = ""

@@ -129,8 +129,6 @@ class AMem:
         source = self.services.llm.module
         texts = [self._shown(note) for note in self._found(input.text, k or self.top)]
         recall = telling.listed([*([telling.NOTES] if texts else []), *texts], source)
-        if self.services.context.layout == "conversation":
-            return recall
         lines = [RecallItem(line, kind="step", source=source, priority=i) for i, (_, line) in enumerate(self._open)]
         return Recall((*recall.items, *lines))
 
@@ -181,7 +179,8 @@ class AMem:
     async def _write(self, note: Note) -> None:
         """Describe a note, then let it and its neighbours evolve."""
         content = telling.course(note.steps, len(note.steps) * (self.step_tokens + 64), self._count)
-        shown = prompt(prompts.ANALYSE, prompts.NOTE.format(note=content), prompts.FILED)
+        words_left = self.answer_tokens // 2
+        shown = prompt(prompts.ANALYSE, prompts.NOTE.format(note=content), prompts.FILED.format(words=words_left))
         analysed = await self.services.ask(
             "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs)
         )
@@ -196,7 +195,7 @@ class AMem:
             prompts.EVOLVE,
             prompts.NEAREST.format(notes=listed),
             prompts.NEW.format(note=note.described(content)),
-            prompts.DECIDED,
+            prompts.DECIDED.format(words=words_left),
         )
         answer = await self.services.ask("evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs))
         if answer.value is not None and answer.value.evolve:

@@ -34,6 +34,7 @@ from agentspec.llm.base import system, user
 from agentspec.memory.buffer_of_thought import prompts
 from agentspec.memory.buffer_of_thought.templates import COARSE, Template
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import written
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -140,6 +141,7 @@ class BufferOfThought:
         self._problem, self._working = "", ""  # what stands in every prompt of the episode
         self._looked_up = ""  # what the template was looked up by
         self._started = False
+        self._done = ""  # the instruction that the newest step followed
         self._course: list[list[str]] = []
         self._finished: list[list[str]] = []  # the course of the episode before, until a template is distilled from it
         self._figures = {"templates": 0, "kept": 0, "known": 0, "coarse": 0}
@@ -156,7 +158,7 @@ class BufferOfThought:
         """The distilled task and the way of working, both chosen before the first action (`k` changes nothing)."""
         if not self._started:
             self._started = True
-            await self._manage(input.instruction)
+            await self._manage()
             await self._begin(input)
         source = self.services.llm.module
         items = []
@@ -170,6 +172,7 @@ class BufferOfThought:
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
+        self._done = transition.input.instruction
         state = excerpt(seen.state, self.state_tokens, self._count)
         self._course = [*self._course, [state, seen.line()]][-MOST_STEPS:]
 
@@ -189,11 +192,11 @@ class BufferOfThought:
         if self.asks:
             prompt = (
                 system(prompts.DISTIL.format(task=self._task(input.instruction))),
-                user(prompts.STATE.format(state=state)),
+                user(prompts.STATE.format(state=state, words=self.answer_tokens // 2)),
             )
             answer = await self.services.ask("distil", prompt, self.answer_tokens)
-            if answer.value and not answer.problem:
-                self._problem = self._looked_up = str(answer.value).strip()
+            self._problem = written(answer, self.answer_tokens, self._count)
+            self._looked_up = self._problem or state
         self._working = self._template_for(self._looked_up)
 
     def _template_for(self, problem: str) -> str:
@@ -211,12 +214,12 @@ class BufferOfThought:
 
     # -- after an episode ------------------------------------------------------------------------------------------
 
-    async def _manage(self, instruction: str) -> None:
+    async def _manage(self) -> None:
         """Distil a template from the episode before, and keep it if it is new."""
         if not self._finished or self._index is None:
             return
         finished, self._finished = self._finished, []
-        template = await self._distilled(instruction, finished) if self.asks else self._without_model(finished)
+        template = await self._distilled(finished) if self.asks else self._without_model(finished)
         if template is None:
             return
         self._figures["templates"] += 1
@@ -225,11 +228,15 @@ class BufferOfThought:
         else:
             self._figures["known"] += 1
 
-    async def _distilled(self, instruction: str, finished: list[list[str]]) -> Template | None:
+    async def _distilled(self, finished: list[list[str]]) -> Template | None:
         course = telling.course(finished[1:], self.course_tokens, self._count)
         prompt = (
-            system(prompts.TEMPLATE.format(task=self._task(instruction))),
-            user(prompts.EPISODE.format(problem=finished[0][1], steps=telling.STEPS, course=course)),
+            system(prompts.TEMPLATE.format(task=self._task(self._done))),
+            user(
+                prompts.EPISODE.format(
+                    problem=finished[0][1], steps=telling.STEPS, course=course, words=self.answer_tokens // 2
+                )
+            ),
         )
         parse = json_of({"category": str, "description": str, "template": str}, repairs=self.repairs)
         answer = await self.services.ask("template", prompt, self.answer_tokens, parse)
@@ -286,12 +293,12 @@ class BufferOfThought:
         return {"size": len(self._buffer), **self._figures}
 
     def snapshot(self) -> bytes:
-        episode = [self._problem, self._working, self._looked_up, self._started]
+        episode = [self._problem, self._working, self._looked_up, self._started, self._done]
         return dump_state([keyed(self._buffer), episode, self._course, self._finished, self._figures])
 
     def restore(self, blob: bytes) -> None:
         buffer, episode, self._course, self._finished, self._figures = load_state(blob)
-        self._problem, self._working, self._looked_up, self._started = episode
+        self._problem, self._working, self._looked_up, self._started, self._done = episode
         self._buffer = {key: Template(*row) for key, row in buffer}
         if self._index is not None:
             self._index.load([(key, template.description) for key, template in self._buffer.items()])

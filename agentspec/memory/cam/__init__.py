@@ -116,7 +116,7 @@ class CamMemory:
         task_tokens: most tokens of the task's instruction in a prompt.
         repairs: 1 to ask again for a choice that cannot be read, else 0.
         capacity: most steps.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
@@ -180,6 +180,7 @@ class CamMemory:
         self._pending: list[Step] = []
         self._lines: list[str] = []
         self._left = False
+        self._task = ""  # the instruction that the newest step followed
         self._evicted = 0
 
     def begin_episode(self, task: Task) -> None:
@@ -192,14 +193,14 @@ class CamMemory:
         """What the model picks, or what is most similar; what an earlier episode left grows first."""
         if self._left and self._pending:
             self._left = False
-            await self._grow(input.instruction)
+            await self._grow()
         found = await self._pick(input.text, k) if self.read == "model" and len(self.nodes) else None
         if found is None:
             top = k or self.top
             near = self.nodes.near(input.text, 2 * top)
             found = list({node.text: (node, score) for node, score in reversed(near)}.values())[::-1][:top]
         notes = [(self.shown(node), score) for node, score in found]
-        lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(notes, lines, self.services.llm.module)
 
     async def _pick(self, state: str, k: int | None) -> list[tuple[Entry, float]] | None:
@@ -248,21 +249,22 @@ class CamMemory:
     async def store(self, transition: Transition) -> None:
         step = Step.of(transition, self.services, self.step_tokens)
         self._pending.append(step)
+        self._task = transition.input.instruction
         self._lines = [*self._lines, step.line][-max(1, self.recent, self.every) :]
         if len(self._pending) >= self.every and not (transition.terminated or transition.truncated):
-            await self._grow(transition.input.instruction)
+            await self._grow()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left grows when the next episode of the run begins."""
 
-    async def _grow(self, instruction: str) -> None:
+    async def _grow(self) -> None:
         """Nodes for the steps that wait, links, clusters, and summaries of those that have changed, level by level."""
         new = [self._assimilate(step) for step in self._pending]
         self._pending = []
         self.levels[0].touch([*new, *self._evict()])
         left = self.most_summaries
         for number in range(len(self.parents)):
-            left -= await self._summarise(number, left, instruction)
+            left -= await self._summarise(number, left)
 
     def _assimilate(self, step: Step) -> int:
         """A node for a step, linked to what belongs to it."""
@@ -290,14 +292,14 @@ class CamMemory:
             self._evicted += 1
         return list(touched)
 
-    async def _summarise(self, number: int, most: int, instruction: str) -> int:
+    async def _summarise(self, number: int, most: int) -> int:
         """Bring one level of summaries up to date with the clusters below; returns the calls made."""
         clusters, parents, above = self.levels[number].clusters(), self.parents[number], self.levels[number + 1]
         gone = [label for label in parents if label not in clusters]
         touched = [n for label in gone for n in self._drop(parents.pop(label), above)]
         changed = [label for label, members in clusters.items() if self._known(parents.get(label)) != members]
         changed = changed[: max(0, most)]
-        answers = await asyncio.gather(*(self._sum_up(clusters[label], instruction) for label in changed))
+        answers = await asyncio.gather(*(self._sum_up(clusters[label]) for label in changed))
         for label, answer in zip(changed, answers, strict=True):
             if answer.value is None:
                 continue
@@ -336,8 +338,8 @@ class CamMemory:
                 above.connect(id, other)
         return before
 
-    async def _sum_up(self, members: list[int], instruction: str) -> Answer[str]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    async def _sum_up(self, members: list[int]) -> Answer[str]:
+        task = task_of(self._task, self.task_tokens, self.services)
         shown = [f"- {one_line(self.nodes[m].text)} [{self._when(m)}]" for m in members[-MOST_MEMBERS:]]
         prompt = (system(SUMMARISE.format(task=task)), user("\n".join([NOTES, *shown])))
         answer = await self.services.ask("summarise", prompt, self.summary_tokens)
@@ -362,10 +364,12 @@ class CamMemory:
         levels = [level.state() for level in self.levels]
         parents = [list(p.items()) for p in self.parents]
         pending = joined(s.json for s in self._pending)
-        return dump_state([self.nodes.state(), levels, parents, pending, self._lines, self._left, self._evicted])
+        flags = [self._left, self._evicted, self._task]
+        return dump_state([self.nodes.state(), levels, parents, pending, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
-        nodes, levels, parents, pending, self._lines, self._left, self._evicted = load_state(blob)
+        nodes, levels, parents, pending, self._lines, flags = load_state(blob)
+        self._left, self._evicted, self._task = flags
         self.nodes.load(nodes)
         for level, state in zip(self.levels, levels, strict=True):
             level.load(state)

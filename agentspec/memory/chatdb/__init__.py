@@ -52,6 +52,7 @@ FILL = (
     "\n\nResults so far:\n{results}\n\nNext step: {about}\nSQL: {sql}\nWrite this statement with every <placeholder> "
     'replaced by what the results say. Answer with JSON:\n{{"sql": the statement}}'
 )
+FROM_ZERO = re.compile(r"\b(?:step|episode): \d")
 PLACEHOLDER = re.compile(r"<[A-Za-z_][\w .-]*>")
 
 
@@ -134,7 +135,7 @@ class ChatDB:
             newest = "WHERE episode = ? AND step >= ? ORDER BY id"
             rows = self._lines(newest, (now.episode, max(0, now.step - self.recent)))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(line, count), priority=3.0 + i) for i, (_, line) in enumerate(rows)]
+            items += [RecallItem(brief(line, count), kind="step", priority=3.0 + i) for i, (_, line) in enumerate(rows)]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:
@@ -176,7 +177,8 @@ class ChatDB:
             self._counts["statements"] += 1
             self._counts["sql_errors"] += result.startswith("error: ")
             about = " ".join(link.about.split())[:120]
-            text = clip_text(f"{about}:\n{result}", self.result_tokens, self.services.llm.count_tokens)
+            counted = " (steps and episodes count from 0)" if FROM_ZERO.search(result) else ""
+            text = clip_text(f"{about}{counted}:\n{result}", self.result_tokens, self.services.llm.count_tokens)
             found.append((about, text))
         self._counts["dropped_rows"] += self.db.trim(self.max_rows, self.max_notes)
         return found

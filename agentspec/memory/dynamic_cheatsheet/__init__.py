@@ -8,8 +8,8 @@ writes the *whole* sheet anew: what it does not copy is lost. The sheet stands v
 - `rs` (retrieval-synthesis): every `every` steps, *before* the action, the `top` past steps most similar to the present
   state are looked up by embedding, and the curator writes the sheet for the present state from the sheet and these,
   the least similar first, each with its similarity. Steps of earlier episodes come before those of the present one,
-  which is what the agent has before its eyes (neighbouring states would fill every place). Where `every` is above 1
-  the curator also reads the steps since the last rewrite, which would pass unseen otherwise.
+  since neighbouring states would fill every place. Where `every` is above 1 the curator also reads the steps since the
+  last rewrite, which would pass unseen otherwise; where it is 1 the agent reads the newest step itself.
 
 AgentSpec's form: a step takes the place of the paper's problem. The steps left at an episode's end are curated with its
 outcome when the next episode of the run begins, so that nothing is asked that no action can profit from, and what is
@@ -52,6 +52,7 @@ PRESETS = {
 HEADER = "Cheat sheet:"
 _TAGS = re.compile(r"<cheatsheet>(.*?)</cheatsheet>", re.DOTALL | re.IGNORECASE)
 _TAG = re.compile(r"</?cheatsheet>", re.IGNORECASE)
+_LEAD = re.compile(r"\A[^\n]*:\s*\n+(?=\s*(?:[-*] |```))")  # "Here is the new sheet:"
 _FENCE = re.compile(r"\A\s*```\w*\n|\n?```\s*\Z")
 
 
@@ -65,7 +66,7 @@ def read_sheet(text: str, tags: bool = True) -> str:
     found = _TAGS.findall(text)
     if not found and (tags or _TAG.search(text)):
         raise ParseError("there is no complete <cheatsheet>...</cheatsheet> in it")
-    sheet = _FENCE.sub("", found[-1] if found else text).strip()
+    sheet = _FENCE.sub("", found[-1] if found else _LEAD.sub("", text.strip())).strip()
     if not sheet:
         raise ParseError("the sheet is empty")
     return str(sheet)
@@ -148,6 +149,7 @@ class DynamicCheatsheet:
         self._unseen: list[int] = []  # `rs`: their keys
         self._lines: list[str] = []  # the same as the agent is told them
         self._waited = 0  # steps since the curator was last asked
+        self._task = ""  # the instruction that the newest step followed
         self._due = False  # whether an earlier episode left something to be curated
         self._pairs: dict[int, Pair] = {}  # `rs`: steps by key
         self._rewrites = 0
@@ -162,22 +164,22 @@ class DynamicCheatsheet:
         self._lines = []
 
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
-        """The sheet; where the conversation does not show them, the steps that it does not know yet."""
+        """The sheet, and the steps that it does not know yet (where the prompt does not tell these anyway)."""
         if self.variant == "rs":
             await self._synthesise(input, k or self.top)
         elif self._due:
-            await self._curate(input.instruction)
+            await self._curate()
         self._due = False
         text = f"{HEADER}\n{self._sheet}"
         items = [RecallItem(text, kind="summary", source=self._name, priority=math.inf)] if self._sheet else []
-        if self.services.context.layout == "snapshot":
-            since = enumerate(self._lines)
-            items += [RecallItem(line, kind="step", source=self._name, priority=i) for i, line in since]
+        since = enumerate(self._lines)
+        items += [RecallItem(line, kind="step", source=self._name, priority=i) for i, line in since]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
         block = telling.told(transition, self.step_tokens, self.services.llm.count_tokens)
         self._lines = [*self._lines, Experience.of(transition).line()][-self._most_waiting :]
+        self._task = transition.input.instruction
         self._waited += 1
         if self.variant == "rs":
             self._keep(transition.input.text, block)
@@ -186,7 +188,7 @@ class DynamicCheatsheet:
         if self.variant == "rs":
             return
         if self._waited >= self.every and not (transition.terminated or transition.truncated):
-            await self._curate(transition.input.instruction, transition.next_text)
+            await self._curate(transition.next_text)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is curated with the outcome when the next episode of the run begins."""
@@ -211,11 +213,11 @@ class DynamicCheatsheet:
 
     # -- curation --------------------------------------------------------------------------------------------------
 
-    async def _curate(self, instruction: str, next_text: str = "") -> None:
+    async def _curate(self, next_text: str = "") -> None:
         """`cu`: the sheet anew from the steps since."""
         steps = f"{telling.STEPS}\n{telling.numbered(self._since)}"
         now = prompts.LEADS_TO.format(state=self._state(next_text)) if next_text else prompts.NEW
-        await self._rewrite("curate", instruction, [steps, now], "")
+        await self._rewrite("curate", self._task, [steps, now], "")
 
     async def _synthesise(self, input: AgentInput, top: int) -> None:
         """`rs`: the sheet anew for the present state, from the past steps most similar to it."""
@@ -269,7 +271,8 @@ class DynamicCheatsheet:
                 self.services.count("truncated")
             return
         self._sheet = self._fit(answer.value, room)
-        self._since, self._lines, self._unseen = [], [], []
+        self._lines = [] if self._since else self._lines[-1:]  # the newest step, where the curator was not told of it
+        self._since, self._unseen = [], []
         self._rewrites += 1
 
     @property
@@ -312,12 +315,12 @@ class DynamicCheatsheet:
         return {"rewrites": self._rewrites, "sheet_tokens": self._count(self._sheet), "steps": len(self._pairs)}
 
     def snapshot(self) -> bytes:
-        flags = [self._waited, self._due, self._rewrites]
+        flags = [self._waited, self._due, self._rewrites, self._task]
         return dump_state([self._sheet, self._since, self._unseen, self._lines, flags, keyed(self._pairs)])
 
     def restore(self, blob: bytes) -> None:
         self._sheet, self._since, self._unseen, self._lines, flags, pairs = load_state(blob)
-        self._waited, self._due, self._rewrites = flags
+        self._waited, self._due, self._rewrites, self._task = flags
         self._pairs = {key: Pair(*row) for key, row in pairs}
         if self._index is not None:
             self._index.load([(key, pair.state) for key, pair in self._pairs.items()])

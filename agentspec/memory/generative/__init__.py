@@ -149,6 +149,7 @@ class GenerativeMemory:
         self._unrated: list[int] = []
         self._sum = 0.0  # importance of events since the last reflection
         self._due = False
+        self._instruction = ""  # that the newest event followed
         self._reflections = 0
 
     def begin_episode(self, task: Task) -> None:
@@ -158,13 +159,14 @@ class GenerativeMemory:
         """The best memories, best first; each counts as used now."""
         if self._due:
             self._due = False
-            await self._rate(input.instruction)
+            await self._rate()
         found = self.stream.recall(input.text, k or self.top, self.services.time().total)
         texts = [self._shown(memory) for memory, _ in found]
         return telling.listed([*([telling.NOTES] if texts else []), *texts], self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:
         seen = Experience.of(transition)
+        self._instruction = transition.input.instruction
         state = excerpt(seen.state, 4 * self.entry_tokens, self._count)
         event = Memory(self.services.new_id(), seen.line(), state, self.services.time().episode)
         self.stream.add(event, MIDDLE if self.rated else seen.reward, self.services.time().total)
@@ -175,23 +177,23 @@ class GenerativeMemory:
         if transition.terminated or transition.truncated:
             return  # what is asked now helps nobody in this episode
         if self.rated and len(self._unrated) >= self.every:
-            await self._rate(transition.input.instruction)
+            await self._rate()
         if self.reflects and self._sum >= self.threshold:
-            await self._reflect(transition.input.instruction)
+            await self._reflect()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         return None
 
     # -- importance and reflection ---------------------------------------------------------------------------------
 
-    async def _rate(self, instruction: str) -> None:
+    async def _rate(self) -> None:
         """Rate the events that wait; those that get no rating stay in the middle."""
         waiting, self._unrated = [id for id in self._unrated if id in self.stream], []
         if not waiting:
             return
         events = telling.numbered(self._shown(self.stream[id]) for id in waiting)
         prompt = (
-            system(prompts.RATE.format(task=self._task(instruction))),
+            system(prompts.RATE.format(task=self._task())),
             user(prompts.EVENTS.format(events=events, count=len(waiting))),
         )
         parse = json_of({"ratings": list[int]}, repairs=self.repairs)
@@ -201,11 +203,11 @@ class GenerativeMemory:
             self.stream.rate(id, _bounded(rating))
         self._sum += sum(self.stream.importance(id) for id in waiting)
 
-    async def _reflect(self, instruction: str) -> None:
+    async def _reflect(self) -> None:
         """Ask questions of the newest memories, and draw conclusions from what is recalled for each."""
         self._sum = 0.0
         self._reflections += 1
-        task = self._task(instruction)
+        task = self._task()
         newest = [self._shown(memory) for memory in list(self.stream)[-RECENT:]]
         memories = "\n".join(telling.newest_that_fit(newest, self.stream_tokens, self._count))
         prompt = (
@@ -249,8 +251,8 @@ class GenerativeMemory:
         when = telling.when(memory.episode, self.services.time().episode)
         return when + telling.course([[memory.state, memory.line]], self.entry_tokens, self._count)
 
-    def _task(self, instruction: str) -> str:
-        return clip_text(instruction.strip(), self.task_tokens, self._count) or "(not told)"
+    def _task(self) -> str:
+        return clip_text(self._instruction.strip(), self.task_tokens, self._count) or "(not told)"
 
     def _count(self, text: str) -> int:
         return self.services.llm.count_tokens(text)
@@ -264,10 +266,12 @@ class GenerativeMemory:
         return {"memories": len(self.stream), **reflected, "evicted": self.stream.evicted}
 
     def snapshot(self) -> bytes:
-        return dump_state([self.stream.state(), self._unrated, self._sum, self._due, self._reflections])
+        flags = [self._sum, self._due, self._reflections, self._instruction]
+        return dump_state([self.stream.state(), self._unrated, flags])
 
     def restore(self, blob: bytes) -> None:
-        stream, self._unrated, self._sum, self._due, self._reflections = load_state(blob)
+        stream, self._unrated, flags = load_state(blob)
+        self._sum, self._due, self._reflections, self._instruction = flags
         self.stream.load(stream)
 
 

@@ -114,12 +114,19 @@ class Stream:
         return sum((weight * normalised(term) for weight, term in terms), start=np.zeros(n))
 
     def recall(self, query: str, k: int, now: int) -> list[tuple[Memory, float]]:
-        """The `k` best memories with their scores, best first; of equals the one written first. They count as used."""
-        scores = self.scores(query, now)
-        best = top_rows(scores, k)
-        self._used[best] = now
-        ids = list(self._memories) if len(best) else []
-        return [(self._memories[ids[row]], float(scores[row])) for row in best]
+        """The `k` best memories with their scores, best first; of equals the one written first. They count as used.
+
+        Of memories that say the same (the steps of episodes of one task often do) only the best is recalled.
+        """
+        scores, ids = self.scores(query, now), list(self._memories)
+        best: dict[str, int] = {}
+        for row in top_rows(scores, len(ids)):
+            if len(best) >= k:
+                break
+            best.setdefault(self._memories[ids[row]].text(), int(row))
+        rows = list(best.values())
+        self._used[rows] = now
+        return [(self._memories[ids[row]], float(scores[row])) for row in rows]
 
     def state(self) -> Json:
         """State as JSON."""

@@ -1,7 +1,7 @@
 """G-Memory (Zhang et al., 2025, arXiv 2506.07398): three graphs of experience, over the episodes of a run.
 
-- *Interaction*: an episode is a chain of steps. Steps that cost something are left out; of a success one call extracts
-  the steps that mattered, of a failure the mistake.
+- *Interaction*: an episode is a chain of steps. Of a success the steps that cost something are left out, and one call
+  extracts those that mattered; of a failure, all of whose steps it sees, the mistake.
 - *Query*: a node per episode (its task and how it began), joined to those of the ten nearest with cosine at least
   `edge`. For a new episode the nearest ones and their neighbours (`hops`) are the related tasks; of `2 * successes`
   candidates with cosine at least `least` the ones that the model finds most relevant (1 to 10) are shown, with the
@@ -16,7 +16,7 @@ and so does the learning from the episode before: what no later episode reads is
 strips digits, and merges into a ninth as many rules, by a slip). Success is what the environment says, or a return of
 at least `threshold`; where neither is given, a return above the mean so far (in the first episode above 0). Where
 there are only successes or only failures, these are compared among themselves. Within the first episode of a run the
-memory holds nothing but, in layout `snapshot`, the newest steps. Of the paper's tables this is the row *ReAct +
+memory holds nothing but the newest steps. Of the paper's tables this is the row *ReAct +
 G-Memory* (preset `paper`).
 
 Bounded by `capacity` episodes (the oldest goes first) and `max_insights` rules. An answer that cannot be read: no key
@@ -51,6 +51,7 @@ from agentspec.memory.gmemory.prompts import (
     told,
     verdict,
 )
+from agentspec.memory.parts import telling
 from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
 from agentspec.parameters import at_least, settings
 from agentspec.reflection.trials import episode_return
@@ -123,7 +124,7 @@ class GMemory:
         task_tokens: most tokens of the task's instruction.
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most episodes.
-        recent: newest steps shown in layout `snapshot`.
+        recent: newest steps shown, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
@@ -214,10 +215,10 @@ class GMemory:
         if self._recalled is None:
             self._recalled = []
             self._began = f"{task_of(input.instruction, self.task_tokens, self.services)}\n{self._start_of(input.text)}"
-            await self._learn(input.instruction)
+            await self._learn()
             self._recalled = await self._related(k)
-        lines = shown_lines(self.services, self._lines, self.recent)
-        newest = [RecallItem(line, source=self._name, priority=1 + i) for i, line in enumerate(lines)]
+        lines = shown_lines(self._lines, self.recent)
+        newest = [RecallItem(line, kind="step", source=self._name, priority=1 + i) for i, line in enumerate(lines)]
         return Recall((*self._recalled, *newest))
 
     async def _related(self, k: int | None) -> list[RecallItem]:
@@ -248,7 +249,6 @@ class GMemory:
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """Keep the episode; what is to be learnt from it is asked when the next episode of the run begins."""
-        steps = [t for t in trajectory.transitions if t.reward >= 0]
         if not trajectory.transitions:
             return
         total = episode_return(trajectory)
@@ -258,11 +258,11 @@ class GMemory:
         self._used = []
         first = trajectory.transitions[0].input
         began = self._began or f"{task_of(first.instruction, self.task_tokens, self.services)}\n{first.text}"
-        each = max(24, self.trial_tokens // max(1, len(steps)))
+        paid = [t for t in trajectory.transitions if t.reward >= 0] if success else []
+        steps = [(t.input.text, Experience.of(t).line()) for t in paid or trajectory.transitions]
         count = self.services.llm.count_tokens
-        blocks = [f"[step {t.step + 1}]\n{Experience.of(t).block(each, count)}" for t in steps]
-        self._chain = clip_text("\n\n".join(blocks), self.trial_tokens + len(steps) * 8, count)
-        actions = clip_text("; ".join(Experience.of(t).line() for t in steps), self.key_tokens, count)
+        self._chain = telling.course(steps, self.trial_tokens, count)
+        actions = telling.course([("", line) for _, line in steps], self.key_tokens, count)
         data = {"success": success, "return": total, "key": actions, "length": len(trajectory.transitions)}
         data["graded"] = trajectory.metrics.get("success") is None and self.threshold is None
         self._unlearnt = self.services.new_id()
@@ -288,7 +288,7 @@ class GMemory:
         for id in [id for id in self.graph if id not in self.episodes]:
             self.graph.remove(id)
 
-    async def _learn(self, instruction: str) -> None:
+    async def _learn(self) -> None:
         """Key steps or mistake of the episode before; from time to time rules out of several; rules merged."""
         if self._unlearnt is None:
             return
@@ -299,7 +299,7 @@ class GMemory:
             ended=f"{verdict(episode)} (return {episode.data['return']:+.2f})",
             what=KEY if good else MISTAKE,
             words=max(8, self.key_tokens // 2),
-            task=task_of(instruction, self.task_tokens, self.services),
+            task=episode.text.partition("\n")[0],
         )
         prompt = (system(static), user(CHAIN.format(chain=self._chain)))
         answer = await self.services.ask("steps" if good else "mistake", prompt, self.key_tokens)

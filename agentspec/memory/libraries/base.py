@@ -88,7 +88,7 @@ class LibraryMemory(ABC):
         top: memories recalled.
         step_tokens: most tokens of a step.
         answer_tokens: most tokens of an answer of the model.
-        recent: newest steps shown with the memories in layout `snapshot`.
+        recent: newest steps shown with the memories, where the prompt does not tell them anyway.
     """
 
     name: ClassVar[str]
@@ -150,7 +150,7 @@ class LibraryMemory(ABC):
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """The memories nearest to the observation, then the newest steps."""
         found = await self._guarded(self.search(input.text, k or self.top)) or []
-        lines = shown_lines(self.services, self._lines, self.recent)
+        lines = shown_lines(self._lines, self.recent)
         return recalled([(f"- {text}", score) for text, score in found], lines, self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:

@@ -33,7 +33,7 @@ class GraphitiLibrary(LibraryMemory):
         top: facts recalled.
         step_tokens: most tokens of a step.
         answer_tokens: most tokens of an answer of the model.
-        recent: newest steps shown with the memories in layout `snapshot`.
+        recent: newest steps shown with the memories, where the prompt does not tell them anyway.
     """
 
     name = "graphiti_library"

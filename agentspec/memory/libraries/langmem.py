@@ -34,7 +34,7 @@ class LangMemLibrary(LibraryMemory):
         instructions: to the manager; empty: the library's.
         step_tokens: most tokens of a step.
         answer_tokens: most tokens of an answer of the model.
-        recent: newest steps shown with the memories in layout `snapshot`.
+        recent: newest steps shown with the memories, where the prompt does not tell them anyway.
     """
 
     name = "langmem_library"

@@ -35,7 +35,7 @@ class Mem0Library(LibraryMemory):
         instructions: how facts are extracted; empty: the library's prompt, which is about a person's preferences.
         step_tokens: most tokens of a step.
         answer_tokens: most tokens of an answer of the model.
-        recent: newest steps shown with the memories in layout `snapshot`.
+        recent: newest steps shown with the memories, where the prompt does not tell them anyway.
     """
 
     name = "mem0_library"

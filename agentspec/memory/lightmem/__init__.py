@@ -3,9 +3,10 @@
 Seven stages, in this order:
 
 1. *Normalise*: each step is stamped with its episode and number.
-2. *Compress*: of the state only the share `rate` of its words is kept, the most surprising ones; action and result stay
-   whole. `compressor: unigram` takes surprise from the words seen so far and makes no call; `model` from the language
-   model's own log-probabilities (`score`, one batch per step, no generation).
+2. *Compress*: of the state only the share `rate` of its words is kept, the most surprising ones (a number with its name
+   and unit counts as one); action and result stay whole. `compressor: unigram` takes surprise from the words seen so
+   far and makes no call; `model` from the language model's own log-probabilities (`score`, one batch per step, no
+   generation).
 3. *Sensory buffer*: steps gather until they hold `sensory_tokens`.
 4. *Segment*: the buffer is cut where neighbouring steps are dissimilar; the last topic stays, for it may go on.
 5. *Short-term memory*: topics gather; before they exceed `stm_tokens` one call extracts facts from all of them, each
@@ -16,9 +17,9 @@ Seven stages, in this order:
 
 AgentSpec's form: a step takes the place of a dialogue turn. The paper compresses with LLMLingua-2 and also places
 boundaries by attention; neither is to be had from an endpoint, so words are weighed by surprise and boundaries set by
-similarity alone. Sleep happens when the next episode begins, before its first decision. In layout `snapshot` the steps
-that are not yet facts are shown in one line each. Of the paper's tables this is the row *ReAct + LightMem* (preset
-`paper`).
+similarity alone. Sleep happens when the next episode begins, before its first decision. The steps that are not yet
+facts are shown in one line each, where the prompt does not tell them anyway. Of the paper's tables this is the row
+*ReAct + LightMem* (preset `paper`).
 
 Bounded by `capacity` (the fact that is oldest goes first), buffers by their tokens. An extraction that cannot be read
 leaves the topics where they are, up to twice `stm_tokens`; in sleep it leaves the fact alone.
@@ -31,13 +32,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
-from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising
+from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising, pieces
 from agentspec.memory.parts.entries import (
     STEPS,
     Entries,
@@ -92,7 +94,7 @@ with numbers, ids and names exact and no pronouns; "source" is the number of the
 
 The agent's task: {task}
 
-Answer with JSON: {{"facts": [{{"source": number, "fact": "..."}}]}}, at most {most} facts."""
+Answer with JSON: {{"facts": [{{"source": number, "fact": "..."}}]}}, at most {most} facts and {words} words in all."""
 SLEEP = """\
 You tidy up an agent's notes. Compare one note with later notes that are like it:
 - "update": a later note adds to it or changes it; "text" is what the note shall say from now on;
@@ -139,7 +141,7 @@ class LightMemory:
         most_sleep: most facts looked at in one sleep, the newest first (0: no sleep).
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most facts.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
@@ -207,6 +209,7 @@ class LightMemory:
         self.topics: list[tuple[int, list[Step]]] = []  # short-term memory
         self._topic = 0  # topics so far
         self._lines: list[str] = []
+        self._task = ""  # the instruction that the newest step followed
         self._asleep = False  # whether an episode has ended since the last sleep
 
     def begin_episode(self, task: Task) -> None:
@@ -220,12 +223,12 @@ class LightMemory:
             self._topics_of(self.sensory)
             self.sensory = []
             if self.topics:
-                await self._extract(input.instruction)
+                await self._extract()
             await self._sleep()
         now = self.services.time()
         found = [(dated(entry, now), score) for entry, score in self.entries.near(input.text, k or self.top)]
         waiting = len(self.sensory) + sum(len(steps) for _, steps in self.topics)
-        lines = shown_lines(self.services, self._lines, max(self.recent, waiting) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, waiting) if self.recent else 0)
         return recalled(found, lines, self.services.llm.module)
 
     async def store(self, transition: Transition) -> None:
@@ -235,9 +238,10 @@ class LightMemory:
         block = replace(seen, state=state).block(self.step_tokens, self.services.llm.count_tokens)
         self.sensory.append(replace(step, text=block))
         self._lines = [*self._lines, step.line][-MOST_LINES:]
+        self._task = transition.input.instruction
         ended = transition.terminated or transition.truncated
         if self._tokens(self.sensory) >= self.sensory_tokens and not ended:
-            await self._segment(transition.input.instruction)
+            await self._segment()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is in the buffers becomes facts in the sleep before the next episode of the run."""
@@ -245,14 +249,20 @@ class LightMemory:
     # -- stages ----------------------------------------------------------------------------------------------------
 
     async def _compressed(self, text: str) -> str:
-        """Stage 2: the words of a state that are kept."""
+        """Stage 2: the words of a state that are kept, in its paragraphs."""
         words = text.split()
         self.words.add(words)
         surprisal = self.words.surprisal(words)
         if self.compressor == "model" and words:
             with contextlib.suppress(BudgetExceededError, ContextOverflowError):  # the words seen so far tell, too
                 surprisal = await self._scored(words)
-        return " ".join(keep_surprising(words, surprisal, self.rate))
+        parts = [pieces(part.split()) for part in re.split(r"\n\s*\n", text)]
+        told = [(i, piece) for i, part in enumerate(parts) for piece in part]
+        each = iter(surprisal)
+        most = [max(itertools.islice(each, len(piece))) for _, piece in told]
+        kept = keep_surprising(told, most, self.rate)
+        by_part = itertools.groupby(kept, key=lambda pair: pair[0])
+        return "\n\n".join(" ".join(word for _, piece in part for word in piece) for _, part in by_part)
 
     async def _scored(self, words: list[str]) -> list[float]:
         """Surprise of each word under the model: the difference of two beginnings' log-probabilities."""
@@ -260,7 +270,7 @@ class LightMemory:
         scores = await self.services.llm.score((user("What is seen:"),), beginnings)
         return [before - after for before, after in zip((0.0, *scores), scores, strict=False)]
 
-    async def _segment(self, instruction: str) -> None:
+    async def _segment(self) -> None:
         """Stages 4 and 5: topics move to short-term memory, which becomes facts before it is too full."""
         vectors = self.entries.embed([s.text for s in self.sensory])
         starts = boundaries([float(a @ b) for a, b in itertools.pairwise(vectors)])
@@ -268,7 +278,7 @@ class LightMemory:
         ready, self.sensory = self.sensory[:done], self.sensory[done:]
         full = sum(self._tokens(steps) for _, steps in self.topics)
         if self.topics and full + self._tokens(ready) > self.stm_tokens:
-            await self._extract(instruction)
+            await self._extract()
         cuts = [0, *starts] if starts else [0, done]
         for begin, end in itertools.pairwise(cuts):
             self._topics_of(ready[begin:end])
@@ -280,11 +290,11 @@ class LightMemory:
             self.topics.append((self._topic, steps))
             self._topic += 1
 
-    async def _extract(self, instruction: str) -> None:
+    async def _extract(self) -> None:
         """Stage 6: one call over short-term memory; its facts are added as they are."""
         steps = [(topic, step) for topic, steps in self.topics for step in steps]
         parse = json_of({"facts": list[dict[str, Any]]}, repairs=self.repairs)
-        answer = await self.services.ask("extract", self._extraction(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
         self.topics = []
@@ -298,8 +308,8 @@ class LightMemory:
                 entry = Entry(self.services.new_id(), one_line(text), step.time, {"topic": topic, "checked": -1})
                 self.entries.put(entry)
 
-    def _extraction(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _extraction(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         parts, number = [STEPS], 0
         newest = self.topics[-1][1][-1].time
         for topic, steps in self.topics:
@@ -307,7 +317,10 @@ class LightMemory:
             for step in steps:
                 parts.append(f"[{number}] {stamp(step.time, newest)}\n{step.text}")
                 number += 1
-        return (system(EXTRACT.format(task=task, most=self.max_facts)), user("\n\n".join(parts)))
+        return (
+            system(EXTRACT.format(task=task, most=self.max_facts, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _sleep(self) -> None:
         """Stage 7: every fact that later facts may change is looked at once per such fact."""
@@ -356,12 +369,12 @@ class LightMemory:
     def snapshot(self) -> bytes:
         topics = [[topic, [s.row() for s in steps]] for topic, steps in self.topics]
         sensory = joined(s.json for s in self.sensory)
-        flags = [self._topic, self._asleep]
+        flags = [self._topic, self._asleep, self._task]
         return dump_state([self.entries.state(), self.words.counts, sensory, topics, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, self.words.counts, sensory, topics, self._lines, flags = load_state(blob)
-        self._topic, self._asleep = flags
+        self._topic, self._asleep, self._task = flags
         self.entries.load(entries)
         self.sensory = [Step.load(s) for s in sensory]
         self.topics = [(topic, [Step.load(s) for s in steps]) for topic, steps in topics]

@@ -8,6 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+UNIT = 3
+"""Letters of a unit (`min`, `km`, `s`) at most."""
 
 
 class WordCounts:
@@ -40,7 +45,30 @@ def normal(word: str) -> str:
     return word.strip(".,;:!?()[]{}\"'").casefold()
 
 
-def keep_surprising(words: Sequence[str], surprisal: Sequence[float], rate: float) -> list[str]:
+def pieces(words: Sequence[str]) -> list[list[str]]:
+    """Words that say nothing without each other: a number with the name before it, and with a short unit after it.
+
+    >>> pieces("order 2: ready in 32 s, restaurant 4 (99.8m, -223.7m)".split())
+    [['order', '2:'], ['ready'], ['in', '32', 's,'], ['restaurant', '4'], ['(99.8m,', '-223.7m)']]
+    """
+    found: list[list[str]] = []
+    for word in words:
+        last = found[-1] if found else []
+        numbered = any(map(_has_digit, last))
+        point = bool(last) and last[-1].startswith("(") and ")" not in last[-1]
+        unit = numbered and normal(last[-1]).isdigit() and 0 < len(normal(word)) <= UNIT and not _has_digit(word)
+        if last and (point or unit or (_has_digit(word) and not numbered and not word.startswith("("))):
+            last.append(word)
+        else:
+            found.append([word])
+    return found
+
+
+def _has_digit(word: str) -> bool:
+    return any(sign.isdigit() for sign in word)
+
+
+def keep_surprising(words: Sequence[T], surprisal: Sequence[float], rate: float) -> list[T]:
     """The most surprising words in their order: max(1, floor(rate * n)) of n; of equals the earlier ones.
 
     >>> keep_surprising(["the", "mill", "is", "open"], [0.1, 3.0, 0.2, 2.0], 0.5)

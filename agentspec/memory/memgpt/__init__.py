@@ -19,13 +19,14 @@ Cost per step: none to retrieve; at most 2 calls per `every` steps (1 to 2 after
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, outcome, step_name, step_text, written
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -42,8 +43,10 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 BLOCKS = ("task", "strategy")
 PAGE = 5
+SEARCHES = ("archive_search", "recall_search")
 WARN, DOWN_TO, KEEP = 0.75, 0.75, 3
 MOST_CALLS = 4
+CHARS_PER_TOKEN, LEAST_CHARS = 3, 60
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,8 @@ class MemGPT:
     Args:
         preset: `paper` (asked after every step, blocks of 2,000 characters) or `rl` (every 8 steps, 600 characters).
         every: steps between requests for function calls; a queue under pressure asks too, once per eviction.
-        block_chars: most characters of a core block; a call that would exceed it is refused with an error.
+        block_chars: most characters of a core block, and no more than what may be recalled in a step has room for (for
+            2,000 set `recall_tokens: 1400`); a call that would exceed it is refused with an error.
         queue_tokens: capacity of the queue (0: of a conversation 0.8 of the model's window, otherwise half of what
             may be recalled in a step).
         max_recall: most steps in recall storage; the oldest go first.
@@ -135,6 +139,14 @@ class MemGPT:
             return self.queue_tokens
         return int(0.8 * context.window) if context.layout == "conversation" else context.recall_tokens // 2
 
+    @property
+    def room(self) -> int:
+        """Characters that a block may hold: what is written there is always shown, whole."""
+        context = self.services.context
+        queue = min(self.capacity, context.recall_tokens // 2) if context.layout == "snapshot" else 0
+        tokens = context.recall_tokens - queue
+        return min(self.block_chars, max(LEAST_CHARS, CHARS_PER_TOKEN * tokens // len(BLOCKS)))
+
     def begin_episode(self, task: Task) -> None:
         self._asked, self._queued, self._warned = 0, 0, False
         self._found, self.summary = [], ""
@@ -143,7 +155,7 @@ class MemGPT:
     async def retrieve(self, input: AgentInput, k: int | None = None) -> Recall:
         """Core blocks, what the last search found; where no conversation shows them, summary and queue."""
         items = [
-            RecallItem(f"[{self._label(name)}] {text}", kind="core", source=name, priority=4.0)
+            RecallItem(f"[{self._label(name)}] {text}", kind="core", source=name, priority=math.inf)
             for name, text in self.blocks.items()
             if text
         ]
@@ -152,7 +164,8 @@ class MemGPT:
             if self.summary:
                 items.append(RecallItem(CARRY.format(summary=self.summary), kind="summary", priority=3.0))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(m), count), priority=5.0 + m.step) for m in self._queue()]
+            queue = [(m.step, brief(self._named(m), count)) for m in self._queue()]
+            items += [RecallItem(text, kind="step", priority=5.0 + step) for step, text in queue]
         return Recall(tuple(items[:k] if k is not None else items))
 
     async def store(self, transition: Transition) -> None:
@@ -177,15 +190,17 @@ class MemGPT:
         """Ask for function calls; with a heartbeat once more, with what the first ones gave."""
         since, self._asked = self._asked, step
         results: list[str] = []
-        for round in range(2):
+        searched = False
+        for _ in range(2):
             answer = await self.services.ask(
                 "edit", self._prompt(since, warning, results), self.answer_tokens, json_of(FunctionCalls)
             )
             if answer.value is None:
                 return
-            if round == 0:
-                self._found = []
-            results = [self._call(call) for call in answer.value.calls[:MOST_CALLS]]
+            calls = answer.value.calls[:MOST_CALLS]
+            if not searched and any(call.function in SEARCHES for call in calls):
+                self._found, searched = [], True
+            results = [self._call(call) for call in calls]
             failed = any(r.startswith("Error") for r in results)
             if not (answer.value.heartbeat or failed) or not results:
                 return
@@ -197,10 +212,10 @@ class MemGPT:
         steps = [self._named(m) for m in ours][::-1]
         told = "\n\nResults of your calls:\n" + "\n".join(results) if results else ""
         return EDIT.format(
-            chars=self.block_chars,
+            chars=self.room,
             task=self._task,
             blocks="\n".join(
-                f"{self._label(n)} ({len(t)} of {self.block_chars}): {t or '(empty)'}" for n, t in self.blocks.items()
+                f"{self._label(n)} ({len(t)} of {self.room}): {t or '(empty)'}" for n, t in self.blocks.items()
             ),
             archived=len(self.archive),
             recorded=len(self.recall),
@@ -241,8 +256,8 @@ class MemGPT:
     def _set_block(self, block: str, text: str) -> str:
         if block not in self.blocks:
             return f"Error: there is no block {block[:40]!r}; expected one of {', '.join(self.blocks)}"
-        if len(text) > self.block_chars:
-            full = f"Error: block {block} would hold {len(text)} of {self.block_chars} characters"
+        if len(text) > max(self.room, len(self.blocks[block]) - 1):
+            full = f"Error: block {block} would hold {len(text)} of {self.room} characters"
             return f"{full}; shorten it with core_replace, or use archive_insert"
         self.blocks[block] = text
         self._old_task = self._old_task and block != "task"
@@ -272,7 +287,8 @@ class MemGPT:
 
     def _recall_search(self, call: FunctionCall) -> str:
         page = max(0, call.page)
-        hits = self._words.search(call.query, PAGE * (page + 1))
+        hits = self._words.search(call.query, 2 * PAGE * (page + 1))
+        hits = distinct(hits, lambda key: self.recall[key].text)
         return self._page([self._named(self.recall[key]) for key, _ in hits], page)
 
     def _page(self, texts: list[str], page: int) -> str:

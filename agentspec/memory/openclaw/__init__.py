@@ -19,14 +19,14 @@ and only where a later episode starts from this one's memory. `preset: paper` st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.memory.openclaw.files import FileTree, Skill, one_line, rule_name, rules_of, rules_text, skills_in, slug
+from agentspec.memory.openclaw.files import FileTree, Skill, one_line, rule_name, rules_text, skills_in, slug
 from agentspec.memory.openclaw.log import Log
 from agentspec.memory.openclaw.prompts import DREAM, FLUSH, HEAD, LEARN, NOTHING
 from agentspec.memory.openclaw.search import Chunk, decay, dream_score, kept_share
+from agentspec.memory.openclaw.workspace import Edit, Edits, Rule, Workspace
 from agentspec.memory.parts.steps import (
     brief,
     distinct,
@@ -57,31 +57,6 @@ EDITS = 3
 BEFORE = 4  # older steps that a prompt shows before the new ones
 
 
-@dataclass(frozen=True)
-class Edit:
-    """One change of the workspace, by the name of a rule or a skill."""
-
-    op: Literal["add", "update", "remove", "skill"]
-    name: str
-    text: str = ""
-    description: str = ""
-
-
-@dataclass(frozen=True)
-class Edits:
-    """The answer of a model that learns."""
-
-    edits: list[Edit]
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A rule of a rewritten `MEMORY.md`."""
-
-    name: str
-    text: str
-
-
 class OpenClaw:
     """Rules, skills and logs as files.
 
@@ -110,7 +85,7 @@ class OpenClaw:
         promoted: most log entries that are promoted at once.
         max_loss: share of `MEMORY.md`'s rules that a rewrite may lose; one that loses more is refused.
         state_tokens: most tokens of the state kept with a step.
-        answer_tokens: most tokens of each answer.
+        answer_tokens: most tokens of each answer (a rewrite of `MEMORY.md` has twice `memory_tokens`).
         steps_tokens: most tokens of steps in a prompt.
     """
 
@@ -180,15 +155,12 @@ class OpenClaw:
         self.services = services
         self.least, self.recent, self.skills_shown, self.skill_least = least, recent, skills_shown, skill_least
         self.diverse, self.half_life = diverse, half_life
-        self.memory_tokens, self.skill_tokens = memory_tokens, skill_tokens
-        self.max_skills = max_skills
+        self.workspace = Workspace(self._count, memory_tokens, skill_tokens, max_skills)
         self.reserve, self.soft, self.keep = reserve, soft, keep
         self.window = window or services.context.window
         self.gate = (least_score, least_recalls, least_queries)
         self.promoted, self.max_loss, self.state_tokens = promoted, max_loss, state_tokens
         self.given = {slug(s.name): s for s in skills_in(skills)} if skills else {}
-        self.rules: dict[str, str] = {}  # in the order in which they were written last
-        self.skills: dict[str, Skill] = {}
         self.log = Log(services.embedder, max_log)
         self._since, self._held_from = 0, 0  # steps of this episode
         self._flushed = False
@@ -203,7 +175,7 @@ class OpenClaw:
         now = self.services.time()
         items = [
             RecallItem(f"- **{name}**: {text}", kind="procedural", source="MEMORY.md", priority=4.0)
-            for name, text in self.rules.items()
+            for name, text in self.workspace.rules.items()
         ]
         items += self._skill_items(input.text)
         notes = self.log.notes(now.episode - 1, NOTES)
@@ -214,7 +186,7 @@ class OpenClaw:
         if self.services.context.layout == "snapshot":
             newest = [c for c in self._today() if not c.note and c.step >= now.step - self.recent]
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(c), count), 1.0, priority=5.0 + c.step) for c in newest]
+            items += [RecallItem(brief(self._named(c), count), 1.0, "step", priority=5.0 + c.step) for c in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -241,43 +213,15 @@ class OpenClaw:
         steps = [self._named(c) for c in self._today() if not c.note and c.step >= self._since - BEFORE]
         head = HEAD.format(
             task=self._task,
-            rules=self._rules_shown(),
+            rules=self.workspace.rules_shown(),
             skills="\n".join(f"- {s.name}: {s.description}" for s in self._all_skills().values()) or "(none)",
             steps="\n".join(newest_within(steps, self.steps_tokens, count) + ([ending] if ending else [])),
         )
         self._since = step
-        prompt = head + LEARN.format(most=EDITS)
+        prompt = head + LEARN.format(most=EDITS, words=self.answer_tokens // 2)
         answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits))
         for edit in answer.value.edits[:EDITS] if answer.value else ():
-            self._apply(edit)
-
-    def _apply(self, edit: Edit) -> None:
-        """One edit; one that says nothing, or removes what is not there, changes nothing."""
-        count, name = self.services.llm.count_tokens, rule_name(edit.name)
-        text = clip_text(edit.text.strip(), self.skill_tokens, count)
-        if not name or (edit.op != "remove" and not text):
-            return
-        self._counts["edits"] += 1
-        if edit.op == "remove":
-            self.rules.pop(name, None)
-            self.skills.pop(slug(name), None)
-        elif edit.op == "skill":
-            described = clip_text(one_line(edit.description or text), self.skill_tokens // 4, count)
-            self.skills.pop(slug(name), None)
-            self.skills[slug(name)] = Skill(name, described, text)
-            while len(self.skills) > self.max_skills:
-                self.skills.pop(next(iter(self.skills)))
-        else:
-            self._write_rules({**{n: t for n, t in self.rules.items() if n != name}, name: one_line(text)})
-
-    def _write_rules(self, rules: Mapping[str, str]) -> None:
-        """`MEMORY.md` anew, within its budget: the rule written longest ago goes first, the last one is clipped."""
-        count = self.services.llm.count_tokens
-        self.rules = dict(rules)
-        while len(self.rules) > 1 and count(rules_text(self.rules)) > self.memory_tokens:
-            self.rules.pop(next(iter(self.rules)))
-        if len(self.rules) == 1:
-            self.rules = {name: clip_text(text, self.memory_tokens, count) for name, text in self.rules.items()}
+            self._counts["edits"] += self.workspace.apply(edit)
 
     async def _make_room(self, step: int) -> None:
         """Before the conversation is cut, and once per cut, write down what must not be lost; then cut it."""
@@ -302,7 +246,7 @@ class OpenClaw:
         ]
         prompt = FLUSH.format(
             task=self._task,
-            rules=self._rules_shown(),
+            rules=self.workspace.rules_shown(),
             turns="\n".join(newest_within(turns, 2 * self.steps_tokens, count)),
             most=NOTES,
         )
@@ -324,17 +268,19 @@ class OpenClaw:
         if not best:
             return
         entries = "\n".join(f"- {self.log[key].text}" for _, key in sorted(best, key=lambda hit: hit[1]))
-        prompt = DREAM.format(rules=self._rules_shown(), entries=entries)
-        answer = await self.services.ask("dream", prompt, self.answer_tokens, json_of({"rules": list[Rule]}))
+        most = self.workspace.rule_tokens
+        prompt = DREAM.format(rules=self.workspace.rules_shown(), entries=entries, words=most * 2 // 3)
+        room = max(self.answer_tokens, 2 * most)  # all rules, and the JSON around them
+        answer = await self.services.ask("dream", prompt, room, json_of({"rules": list[Rule]}))
         if answer.value is None:
             return
         rules = {
             rule_name(r.name): one_line(r.text) for r in answer.value["rules"] if rule_name(r.name) and r.text.strip()
         }
-        if not rules or kept_share(self.rules, rules) < 1 - self.max_loss:
+        if not rules or kept_share(self.workspace.rules, rules) < 1 - self.max_loss:
             self._counts["rewrites_refused"] += 1
             return
-        self._write_rules(rules)
+        self.workspace.write(rules)
         for _, key in best:
             self.log.promote(key)
         self._counts["promoted"] += len(best)
@@ -384,10 +330,7 @@ class OpenClaw:
 
     def _all_skills(self) -> dict[str, Skill]:
         """Skills by path; one that was learnt stands for one that was given under the same name."""
-        return {**self.given, **self.skills}
-
-    def _rules_shown(self) -> str:
-        return "\n".join(f"- {name}: {text}" for name, text in self.rules.items()) or "(none)"
+        return {**self.given, **self.workspace.skills}
 
     def _today(self) -> list[Chunk]:
         """The log of this episode."""
@@ -397,8 +340,11 @@ class OpenClaw:
         name = step_name(chunk.episode, chunk.step, self.services.time())
         return f"{'Note of ' + name[0].lower() + name[1:] if chunk.note else name}: {chunk.text}"
 
+    def _count(self, text: str) -> int:
+        return self.services.llm.count_tokens(text)
+
     def _clip(self, text: str) -> str:
-        return clip_text(text, self.skill_tokens, self.services.llm.count_tokens)
+        return clip_text(text, self.workspace.skill_tokens, self.services.llm.count_tokens)
 
     @staticmethod
     def _log_path(episode: int) -> str:
@@ -406,8 +352,8 @@ class OpenClaw:
 
     def files(self) -> FileTree:
         """The workspace as files: `MEMORY.md`, logs, and the skills that were learnt."""
-        tree = FileTree({"MEMORY.md": rules_text(self.rules)})
-        for skill in self.skills.values():
+        tree = FileTree({"MEMORY.md": rules_text(self.workspace.rules)})
+        for skill in self.workspace.skills.values():
             tree.write(skill.path, skill.text())
         for chunk in self.log.values():
             path = self._log_path(chunk.episode)
@@ -423,18 +369,16 @@ class OpenClaw:
 
     def metrics(self) -> Mapping[str, Any]:
         """Rules, skills and log entries there are; edits, cuts, promotions and refused rewrites so far."""
-        sizes = {"rules": len(self.rules), "skills": len(self.skills), "log": len(self.log)}
+        sizes = {"rules": len(self.workspace.rules), "skills": len(self.workspace.skills), "log": len(self.log)}
         return {**sizes, **self._counts}
 
     def snapshot(self) -> bytes:
-        skills = [asdict(skill) for skill in self.skills.values()]
         here = [self._since, self._held_from, self._flushed, self._task]
-        return dump_state([rules_text(self.rules), skills, self.log.state(), here, self._counts])
+        return dump_state([*self.workspace.state(), self.log.state(), here, self._counts])
 
     def restore(self, blob: bytes) -> None:
         rules, skills, log, here, self._counts = load_state(blob)
-        self.rules = rules_of(rules)
-        self.skills = {slug(s["name"]): Skill(**s) for s in skills}
+        self.workspace.load(rules, skills)
         self.log.load(log)
         self._since, self._held_from, self._flushed, self._task = here
 

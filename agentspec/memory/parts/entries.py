@@ -54,7 +54,7 @@ class Entry(Record):
 
 @dataclass(frozen=True)
 class Step(Record):
-    """A step that waits to become notes: when it was, told in full, and in one line."""
+    """A step that waits to become notes: when it was, told in full, and in one line; each within a budget."""
 
     time: Time
     text: str
@@ -62,11 +62,12 @@ class Step(Record):
 
     @classmethod
     def of(cls, transition: Transition, services: Services, tokens: int) -> Step:
-        """The step of a transition that has just been made; its text has at most `tokens`."""
+        """The step of a transition that has just been made; its text and its line have at most `tokens` each."""
         now = services.time()
         time = Time(now.episode, transition.step, max(0, now.total - now.step + transition.step))
         seen = Experience.of(transition)
-        return cls(time, seen.block(tokens, services.llm.count_tokens), seen.line())
+        count = services.llm.count_tokens
+        return cls(time, seen.block(tokens, count), clip_text(one_line(seen.line()), tokens, count))
 
     def row(self) -> list[Any]:
         return [numbers(self.time), self.text, self.line]
@@ -274,7 +275,7 @@ def one_line(text: str) -> str:
 def recalled(notes: Iterable[tuple[str, float]], lines: Sequence[str], source: str) -> Recall:
     """Notes, the best first, and after them the newest steps (which matter most), oldest first."""
     items = [RecallItem(text, score, "semantic", source, -i) for i, (text, score) in enumerate(notes)]
-    newest = [RecallItem(line, source=source, priority=1 + i) for i, line in enumerate(lines)]
+    newest = [RecallItem(line, kind="step", source=source, priority=1 + i) for i, line in enumerate(lines)]
     return Recall((*items, *newest))
 
 
@@ -283,9 +284,9 @@ def dated(entry: Entry, now: Time) -> str:
     return f"- {entry.text} [{stamp(entry.time, now)}]"
 
 
-def shown_lines(services: Services, lines: Sequence[str], most: int) -> list[str]:
-    """The newest lines, where the conversation does not hold the steps themselves."""
-    return list(lines)[-most:] if most and services.context.layout == "snapshot" else []
+def shown_lines(lines: Sequence[str], most: int) -> list[str]:
+    """The newest lines; those of steps that the prompt tells anyway are left out there (`agentspec.prompting`)."""
+    return list(lines)[-most:] if most else []
 
 
 __all__ = [

@@ -12,7 +12,7 @@ from agentspec.memory.parts.telling import newest_that_fit
 from agentspec.services import Answer, Services, Time
 from agentspec.tokens import CountTokens, clip_text, excerpt
 from agentspec.trajectory import Trajectory
-from agentspec.types import Experience, Transition
+from agentspec.types import Experience, RecallItem, Transition
 
 FEEDBACK_TOKENS = 64
 """Most tokens kept of what the environment said about an action."""
@@ -53,12 +53,21 @@ def distinct(hits: Sequence[tuple[int, float]], text: Callable[[int], str]) -> l
     return list(found.values())
 
 
+def newest_steps(texts: Sequence[str], recent: int, count_tokens: CountTokens) -> list[RecallItem]:
+    """Steps that no entry knows yet: the newest `recent` before everything else, older ones where there is room."""
+    first = len(texts) - recent
+    return [
+        RecallItem(brief(text, count_tokens), kind="step", priority=5.0 + i if i >= first else i / len(texts))
+        for i, text in enumerate(texts)
+    ]
+
+
 def step_name(episode: int, step: int, now: Time) -> str:
     """`Step 3` of this episode, `Episode 1, step 3` of an earlier one; both count from 1."""
     return f"Step {step + 1}" if episode == now.episode else f"Episode {episode + 1}, step {step + 1}"
 
 
-def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) -> list[str]:
+def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens, what: str = "steps") -> list[str]:
     """The newest texts that fit into `tokens`, in order, with a line that says how many older ones do not.
 
     Before a step is left out, the states of all are shortened. Of a single text that is too long the beginning is kept.
@@ -67,7 +76,7 @@ def newest_within(texts: Sequence[str], tokens: int, count_tokens: CountTokens) 
         texts = [brief(text, count_tokens) for text in texts]
     kept = newest_that_fit(texts, tokens, count_tokens)
     gone = len(texts) - len(kept)
-    return ([f"({gone} earlier steps are left out)"] if gone else []) + kept
+    return ([f"({gone} earlier {what} are left out)"] if gone else []) + kept
 
 
 def goal_of(instruction: str, count_tokens: CountTokens) -> str:

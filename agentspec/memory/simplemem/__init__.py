@@ -28,8 +28,8 @@ Cost: one call per `window` of steps that pass, and one per cluster; retrieval 0
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
@@ -47,7 +47,8 @@ from agentspec.memory.parts.entries import (
     task_of,
     told,
 )
-from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, WORD, Note, data_of
+from agentspec.memory.simplemem.names import Named, is_vague, names_in
+from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, Check, Note, Plan, data_of
 from agentspec.parameters import at_least, settings
 from agentspec.services import Services
 from agentspec.state import dump_state, joined, load_state
@@ -84,11 +85,6 @@ SEMANTIC, LEXICAL, STRUCTURED = 25, 5, 5
 """Most notes that each way of looking up contributes."""
 MOST_QUERIES, MOST_CHECKS = 4, 2
 
-_NAME = re.compile(r"\b(?:[A-Z][\w-]*|\w*\d[\w.]*)\b")
-_VAGUE = re.compile(
-    r"\b(he|she|it|they|him|her|them|this|these|those|now|today|yesterday|tomorrow|later|soon|recently|ago)\b", re.I
-)
-
 
 class SimpleMemory:
     """Gate, compression, consolidation, and look-up in three ways.
@@ -116,7 +112,7 @@ class SimpleMemory:
         match_weight: weight of a place or entity that matches.
         plan: whether the model plans retrieval.
         capacity: most notes, and most notes in the archive.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
@@ -190,12 +186,13 @@ class SimpleMemory:
         self.capacity, self.recent = capacity, recent
         self.entries = Entries(embedder_of(services), capacity, words=True)
         self.archive: list[Entry] = []
-        self._named: dict[str, dict[int, None]] = {}  # place or entity -> notes that name it
+        self._named = Named()
         self._window: list[Step] = []  # the overlap, then the steps that are not notes yet
         self._new = 0  # how many of these are new
         self._before: list[list[str]] = []  # what the gate compares with: states, and what was done in them
         self._lines: list[str] = []
         self._left = False
+        self._task = ""  # the instruction that the newest step followed
         self._dropped = 0
 
     def begin_episode(self, task: Task) -> None:
@@ -209,10 +206,10 @@ class SimpleMemory:
         """The notes that score best; what an earlier episode left is written first."""
         if self._left and self._new:
             self._left = False
-            await self._compress(input.instruction)
+            await self._compress()
         now = self.services.time()
         found = await self._planned(input.text, k) if self.plan else self.search(input.text, k)
-        lines = shown_lines(self.services, self._lines, max(self.recent, self._new) if self.recent else 0)
+        lines = shown_lines(self._lines, max(self.recent, self._new) if self.recent else 0)
         return recalled([(dated(e, now), score) for e, score in found], lines, self.services.llm.module)
 
     def search(self, query: str, k: int | None = None) -> list[tuple[Entry, float]]:
@@ -226,7 +223,7 @@ class SimpleMemory:
         cosine = {entry.id: score for entry, score in self.entries.near(query, SEMANTIC)}
         bm25 = {entry.id: score for entry, score in self.entries.by_words(query, LEXICAL)}
         top = max(bm25.values(), default=1.0)
-        named = self._naming(query)
+        named = [id for id in self._named.by(query) if id in self.entries]
         ids = dict.fromkeys([*cosine, *bm25, *named[:STRUCTURED]])
         scores = {
             id: cosine.get(id, 0.0) + self.words_weight * bm25.get(id, 0.0) / top + self.match_weight * (id in named)
@@ -239,14 +236,8 @@ class SimpleMemory:
 
     def depth_of(self, query: str) -> int:
         """How many notes a query of this complexity recalls."""
-        complexity = min(1.0, len(set(_NAME.findall(query))) / 20)
+        complexity = min(1.0, len(names_in(query)) / 20)
         return math.floor(self.top * (1 + self.depth * complexity))
-
-    def _naming(self, query: str) -> list[int]:
-        """Notes with a place or entity that the query names."""
-        words = [w.casefold() for w in WORD.findall(query)]
-        phrases = dict.fromkeys(" ".join(words[i : i + n]) for n in (3, 2, 1) for i in range(len(words) - n + 1))
-        return [id for id in dict.fromkeys(id for p in phrases for id in self._named.get(p, ())) if id in self.entries]
 
     async def _planned(self, state: str, k: int | None) -> list[tuple[Entry, float]]:
         """Queries written by the model, and what it finds still missing; the observation itself is always looked up."""
@@ -254,8 +245,8 @@ class SimpleMemory:
         if not found:
             return []
         seen = SEEN.format(state=excerpt(state, self.step_tokens, self.services.llm.count_tokens))
-        answer = await self._ask("plan", PLAN, seen, {"queries": list[str]})
-        queries = answer["queries"] if answer else []
+        plan = await self._ask("plan", PLAN, seen, Plan)
+        queries: Sequence[str] = plan.queries if plan else ()
         for check in range(MOST_CHECKS + 1):
             for query in queries[:MOST_QUERIES]:
                 found |= {id: pair for id, pair in self._keyed(self.search(query, k)) if id not in found}
@@ -263,14 +254,14 @@ class SimpleMemory:
                 break
             now = self.services.time()
             notes = "\n".join([NOTES, *(dated(entry, now) for entry, _ in found.values())])
-            answer = await self._ask("check", CHECK, f"{seen}\n\n{notes}", {"enough": bool, "queries": list[str]})
-            queries = answer["queries"] if answer and not answer["enough"] else []
+            said = await self._ask("check", CHECK, f"{seen}\n\n{notes}", Check)
+            queries = said.queries if said and not said.enough else ()
         return list(found.values())
 
     def _keyed(self, found: Iterable[tuple[Entry, float]]) -> list[tuple[int, tuple[Entry, float]]]:
         return [(entry.id, (entry, score)) for entry, score in found]
 
-    async def _ask(self, purpose: str, static: str, dynamic: str, schema: object) -> dict[str, list[str]] | None:
+    async def _ask(self, purpose: str, static: str, dynamic: str, schema: object) -> Any:
         parse = json_of(schema, repairs=self.repairs)
         answer = await self.services.ask(purpose, (system(static), user(dynamic)), self.answer_tokens, parse)
         return answer.value
@@ -280,6 +271,7 @@ class SimpleMemory:
     async def store(self, transition: Transition) -> None:
         step = Step.of(transition, self.services, self.step_tokens)
         self._lines = [*self._lines, step.line][-max(1, self.recent, self.window) :]
+        self._task = transition.input.instruction
         parts = [transition.input.text, step.line.partition(". ")[2]]
         novelty = max(self.novelty(part, [b[i] for b in self._before]) for i, part in enumerate(parts))
         novel = novelty >= self.gate or bool(transition.reward)
@@ -289,7 +281,7 @@ class SimpleMemory:
             self._window = [*self._window, step][-2 * self.window - self.overlap :]
             self._new = min(self._new + 1, len(self._window))
         if self._new >= self.window and not (transition.terminated or transition.truncated):
-            await self._compress(transition.input.instruction)
+            await self._compress()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is compressed when the next episode of the run begins."""
@@ -298,17 +290,17 @@ class SimpleMemory:
         """How new a text is beside others: 0 (one of them) to 1 (also where there are none)."""
         if not before:
             return 1.0
-        known = {name for other in before for name in _NAME.findall(other)}
-        names = set(_NAME.findall(text))
+        known = {name for other in before for name in names_in(other)}
+        names = names_in(text)
         fresh = len(names - known) / max(1, len(names))
         vectors = self.entries.embed([text, *before])
         nearest = min(1.0, max(float(vectors[0] @ other) for other in vectors[1:]))
         return self.weight * fresh + (1 - self.weight) * (1 - nearest)
 
-    async def _compress(self, instruction: str) -> None:
+    async def _compress(self) -> None:
         """One call over the window; what it wrote, and what that brought together."""
         parse = json_of({"notes": list[Note]}, repairs=self.repairs)
-        answer = await self.services.ask("compress", self._compression(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("compress", self._compression(), self.answer_tokens, parse)
         at = self._window[-1].time
         if answer.value is None:
             self._new = 0
@@ -323,13 +315,16 @@ class SimpleMemory:
         if self.consolidate:
             await self._merge([e for e in added if e.id in self.entries])
 
-    def _compression(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _compression(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         newest = list(self.entries)[-self.context :] if self.context else []
         now = self._window[-1].time
         parts = ["\n".join([NOTES, *(dated(e, now) for e in newest)])] if newest else []
         parts.append(f"{STEPS}\n{told(self._window)}")
-        return (system(COMPRESS.format(task=task, most=self.max_notes)), user("\n\n".join(parts)))
+        return (
+            system(COMPRESS.format(task=task, most=self.max_notes, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _merge(self, added: list[Entry]) -> None:
         """The largest cluster around a new note becomes one note; its members go into the archive."""
@@ -348,7 +343,7 @@ class SimpleMemory:
             data[name] = list(dict.fromkeys([*data[name], *(n for e in largest for n in e.data[name])]))
         for entry in largest:
             self.entries.remove(entry.id)
-        self._rename()
+        self._named.rebuild(self.entries)
         self.archive = [*self.archive, *largest][-self.capacity :]
         latest = max(largest, key=lambda e: e.time.total).time
         self._put(Entry(self.services.new_id(), one_line(answer.value.text), latest, data))
@@ -368,19 +363,9 @@ class SimpleMemory:
     def _put(self, entry: Entry) -> None:
         before = self.entries.evicted
         self.entries.put(entry)
-        self._name([entry])
+        self._named.add(entry)
         if self.entries.evicted != before:
-            self._rename()
-
-    def _name(self, entries: Iterable[Entry]) -> None:
-        for entry in entries:
-            for name in entry.data["names"]:
-                self._named.setdefault(name, {})[entry.id] = None
-
-    def _rename(self) -> None:
-        """Forget the names of notes that are gone."""
-        self._named = {}
-        self._name(self.entries)
+            self._named.rebuild(self.entries)
 
     # -- state -----------------------------------------------------------------------------------------------------
 
@@ -391,19 +376,19 @@ class SimpleMemory:
             "archived": len(self.archive),
             "evicted": self.entries.evicted,
             "dropped": self._dropped,
-            "vague": sum(bool(_VAGUE.search(e.text)) for e in self.entries),
+            "vague": sum(is_vague(e.text) for e in self.entries),
         }
 
     def snapshot(self) -> bytes:
         archive = joined(e.json for e in self.archive)
-        flags = [self._new, self._left, self._dropped]
+        flags = [self._new, self._left, self._dropped, self._task]
         window = joined(s.json for s in self._window)
         return dump_state([self.entries.state(), archive, window, self._before, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         entries, archive, window, self._before, self._lines, flags = load_state(blob)
-        self._new, self._left, self._dropped = flags
+        self._new, self._left, self._dropped, self._task = flags
         self.entries.load(entries)
         self.archive = [Entry.load(row) for row in archive]
         self._window = [Step.load(s) for s in window]
-        self._rename()
+        self._named.rebuild(self.entries)

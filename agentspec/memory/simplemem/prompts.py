@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from typing import Any
 
-WORD = re.compile(r"[^\W_]+(?:\.\d+)?")
+from agentspec.memory.simplemem.names import WORD
 
 COMPRESS = """\
 You take notes for an agent. Write what its steps taught as notes that help later: what is where (with coordinates),
@@ -16,7 +15,7 @@ that is understood without any other: names in place of pronouns, "step 12" or a
 
 The agent's task: {task}
 
-Answer with JSON, at most {most} notes, an empty list if there is nothing new:
+Answer with JSON, at most {most} notes and {words} words in all, an empty list if there is nothing new:
 {{"notes": [{{"text": "...", "keywords": ["..."], "place": "...", "entities": ["..."], "topic": "..."}}]}}"""
 MERGE = """\
 You tidy up an agent's notes. Write one note in place of the ones below: one or two sentences that say everything that
@@ -45,6 +44,21 @@ class Note:
     place: str | None = ""
     entities: list[str] = field(default_factory=list)
     topic: str | None = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Whether the notes that were found are enough, and what else to look up."""
+
+    enough: bool
+    queries: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to look up."""
+
+    queries: tuple[str, ...] = ()
 
 
 def data_of(note: Note) -> dict[str, Any]:

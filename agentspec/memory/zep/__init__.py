@@ -120,7 +120,7 @@ class ZepMemory:
         task_tokens: most tokens of the task's instruction in a prompt.
         repairs: 1 to ask again for an answer that cannot be read, else 0.
         capacity: most facts.
-        recent: newest steps shown with them in layout `snapshot`.
+        recent: newest steps shown with them, where the prompt does not tell them anyway.
     """
 
     declaration = Declaration(
@@ -194,6 +194,7 @@ class ZepMemory:
         self._lines: list[str] = []
         self._waited = 0
         self._begins: list[list[int]] = []  # episodes: the step of the run each began with, and its number
+        self._task = ""  # the instruction that the newest step followed
         self._ended = False  # whether an episode has ended since communities were looked for
 
     def begin_episode(self, task: Task) -> None:
@@ -209,7 +210,7 @@ class ZepMemory:
         if self._ended:
             self._ended = False
             if self._pending:
-                await self._write(input.instruction)
+                await self._write()
             if self.most_summaries:
                 await self._communities()
         found = self.graph.search(
@@ -217,8 +218,8 @@ class ZepMemory:
         )
         notes = [(self.shown(entry), score) for entry, score in found]
         summary = self.communities.summary_for(self.graph.named_in(input.text))
-        notes = [(f"- {summary}", 1.0), *notes] if summary else notes
-        lines = shown_lines(self.services, self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
+        notes = [(f"- Of earlier episodes: {summary}", 1.0), *notes] if summary else notes
+        lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
         return recalled(notes, lines, self.services.llm.module)
 
     def shown(self, fact: Entry) -> str:
@@ -246,18 +247,19 @@ class ZepMemory:
         if self.extraction == "state":
             return
         self._pending = [*self._pending, step][-2 * self.every :]
+        self._task = transition.input.instruction
         self._waited += 1
         if self._waited >= self.every and not (transition.terminated or transition.truncated):
-            await self._write(transition.input.instruction)
+            await self._write()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is written, and communities are found, when the next episode of the run begins."""
 
-    async def _write(self, instruction: str) -> None:
+    async def _write(self) -> None:
         """Facts out of the steps that wait; then whom they are about, then what they change."""
         self._waited = 0
         parse = json_of({"facts": list[Extracted]}, repairs=self.repairs)
-        answer = await self.services.ask("extract", self._extraction(instruction), self.answer_tokens, parse)
+        answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
         extracted = answer.value["facts"][: self.max_facts]
@@ -266,15 +268,18 @@ class ZepMemory:
         added = [entry for fact in extracted if (entry := self._add(fact, at)) is not None]
         await self._resolve([e for e in added if e.id in self.graph.facts], at)
 
-    def _extraction(self, instruction: str) -> tuple[Message, ...]:
-        task = task_of(instruction, self.task_tokens, self.services)
+    def _extraction(self) -> tuple[Message, ...]:
+        task = task_of(self._task, self.task_tokens, self.services)
         waiting = [s.line for s in self._pending]
         before = [line for line in self._lines if line not in waiting][-self.context :] if self.context else []
         names = list(self.graph.names.values())[-SHOWN_NAMES:]
         parts = [KNOWN.format(names="; ".join(names))] if names else []
         parts += [EARLIER.format(steps="\n".join(before))] if before else []
         parts.append(f"{STEPS}\n{told(self._pending)}")
-        return (system(EXTRACT.format(task=task, most=self.max_facts)), user("\n\n".join(parts)))
+        return (
+            system(EXTRACT.format(task=task, most=self.max_facts, words=self.answer_tokens // 2)),
+            user("\n\n".join(parts)),
+        )
 
     async def _name(self, names: list[str]) -> None:
         """Entities for names: known ones, those the model says they mean, new ones."""
@@ -400,12 +405,12 @@ class ZepMemory:
 
     def snapshot(self) -> bytes:
         pending = joined(s.json for s in self._pending)
-        flags = [self._waited, self._ended, self._begins]
+        flags = [self._waited, self._ended, self._begins, self._task]
         return dump_state([self.graph.state(), self.communities.state(), pending, self._lines, flags])
 
     def restore(self, blob: bytes) -> None:
         graph, communities, pending, self._lines, flags = load_state(blob)
-        self._waited, self._ended, self._begins = flags
+        self._waited, self._ended, self._begins, self._task = flags
         self.graph.load(graph)
         self.communities.load(communities)
         self._pending = [Step.load(s) for s in pending]

@@ -18,27 +18,43 @@ UNREAD = 0.5
 RATE = "Rate how promising this course is for the task, from 1 (hopeless) to 10 (as good as done)."
 IN_WORDS = "Say why in a sentence, then end with the number."
 
+_NEGATED = re.compile(r"(?:\b(?:not|never|hardly|cannot be)|n't|n’t)\s+(?:\w+\s+)?$")
+_SAID = re.compile(
+    r"\b(?:rating|score|answer|choice|best(?: (?:one|course|option))?)\b\W{0,4}(?:is|of|=|:)\W{0,6}(\d+)(?![\d.]*\d)",
+    re.I,
+)
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 _INTEGER = re.compile(r"(?<![\d.])\d+(?![\d.]*\d)")
 
 
 def last_word(text: str, values: Mapping[str, float]) -> float | None:
-    """The value of the known word that stands last in `text`, whatever its case; `None` if none does."""
+    """The value of the known word that stands last in `text`, whatever its case; `None` if none does.
+
+    A word that is denied ("I am not sure") is none.
+    """
     pattern = r"\b(" + "|".join(re.escape(w) for w in values) + r")\b"
-    found = re.findall(pattern, visible(text)[0].casefold())
+    shown = visible(text)[0].casefold()[-10_000:]
+    found = [
+        m[1] for m in re.finditer(pattern, shown) if not _NEGATED.search(shown[max(0, m.start() - 40) : m.start()])
+    ]
     return values[found[-1]] if found else None
 
 
 def last_number(text: str, allowed: Sequence[int]) -> int | None:
-    """The last whole number of `text` that is among `allowed`; `None` if there is none."""
+    """The last whole number of `text` that is among `allowed`, one that is called the rating or the choice first
+    ("Rating: 8 (of 1-10)" means 8); `None` if there is none.
+    """
     text = re.sub(r"(\d+)\s*(?:/|out of)\s*\d+", r"\1", visible(text)[0][-10_000:])  # "7/10" means 7
-    found = [int(m) for m in _INTEGER.findall(text) if len(m) < 10]
-    fitting = [n for n in found if n in allowed]
-    return fitting[-1] if fitting else None
+    for pattern in (_SAID, _INTEGER):
+        fitting = [int(m) for m in pattern.findall(text) if len(m) < 10 and int(m) in allowed]
+        if fitting:
+            return fitting[-1]
+    return None
 
 
 def last_amount(text: str, label: str) -> float | None:
     """The last number after `label` (`Estimate: about $12.50`); `None` if there is none."""
-    shown = visible(text)[0]
+    shown = _THOUSANDS.sub("", visible(text)[0][-10_000:])
     found = re.findall(
         rf"\b{label}\b\W{{0,4}}[^\d\n+-]{{0,20}}([-+]?\$?\s?\d{{1,9}}(?:[.,]\d+)?)", shown, re.IGNORECASE
     )
@@ -58,6 +74,8 @@ async def rate(
         prompts = [with_request(messages, IN_WORDS) for messages in prompts]
     ratings: list[float | None] = []
     for call in await meter.ask_all([Ask("value", messages, sampling) for messages in prompts]):
-        found = [n for n in (last_number(c.text, RATINGS) for c in call.completions) if n is not None]
+        # Of an answer that was cut off the last number is any number.
+        whole = [c for c in call.completions if constrained or c.finish_reason != "length"]
+        found = [n for n in (last_number(c.text, RATINGS) for c in whole) if n is not None]
         ratings.append(sum(found) / len(found) / RATINGS[-1] if found else None)
     return ratings

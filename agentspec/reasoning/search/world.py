@@ -8,7 +8,7 @@ that.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -82,7 +82,7 @@ class RealWorld:
         success = seen.info.get("success")
         return Outcome(
             blob,
-            seen.input.text,
+            _told(seen.info, seen.input.text),
             seen.input.action_schema,
             seen.reward,
             seen.ended,
@@ -129,6 +129,14 @@ class ModelWorld:
         text = _EARNED.sub("", _GOAL.sub("", said)).strip() or "nothing that could be foreseen"
         schema, earned = node.parent.state.schema, last_amount(said, "earned") or 0.0
         return Outcome(None, text, schema, float(reached), ended, reached if ended else None, earned)
+
+
+def _told(info: Mapping[str, Any], text: str) -> str:
+    """An observation with what its action did, or why it failed, in front: at the end it would be cut first."""
+    said = str(info.get("error") or info.get("message") or "").strip()
+    if not said or said in text[: len(said) + 40]:
+        return text
+    return f"{said}\n\n{text}"
 
 
 def root_outcome(input: AgentInput, blob: bytes | None) -> Outcome:

@@ -8,7 +8,7 @@ import gymnasium
 import pytest
 
 from agentspec.envs import check_environment
-from agentspec.envs.alfred.env import AlfredEnv
+from agentspec.envs.alfred.env import RULES, AlfredEnv
 from agentspec.envs.alfred.expert import Expert, luck
 from agentspec.envs.alfred.own import TASKS
 from agentspec.envs.alfred.trials import TYPES
@@ -181,3 +181,25 @@ def test_what_is_in_a_drawer_is_not_on_the_counter_above():
         assert info["metrics"]["goal_conditions_met"] == 0
     wanted = [o for o in env.event.metadata["objects"] if o["objectType"] == "CD"]
     assert ["Drawer"] in [[p.split("|")[0] for p in o["parentReceptacles"] or ()] for o in wanted]
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, None),
+        ({"task": 1}, 1),
+        ({"suite": "paper"}, 7),
+        ({"suite": "paper", "task": 2}, 1),
+        ({"trial_file": ""}, None),
+    ],
+)
+def test_how_many_episodes_there_are(options, count):
+    assert AlfredEnv.episodes(options) == count
+    if "suite" not in options and "trial_file" not in options:
+        env = AlfredEnv(**options)
+        assert len({env.trial_of(seed).id for seed in range(30)}) == (count or 30)
+
+
+def test_the_rules_say_how_each_kind_of_task_is_done() -> None:
+    for means in ("microwave", "fridge", "faucet", "knife", "lamp"):
+        assert means in RULES

@@ -11,9 +11,10 @@ import pytest
 from agentspec.envs.deliverybench.city.generate import generate
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
 from agentspec.envs.deliverybench.expert import errands
-from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier, Style
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier, Style
 from agentspec.envs.deliverybench.expert.errands import Upkeep
 from agentspec.envs.deliverybench.expert.planning import DROPOFF, PICKUP, Job, Planner, Stop, payment
+from agentspec.envs.deliverybench.expert.scripted import luck
 from agentspec.envs.experts import NoPlayer, player, roles
 from agentspec.episode import Job as EpisodeJob
 from agentspec.episode import Runner
@@ -34,7 +35,7 @@ def planner(**options) -> Planner:
 def play(options: dict, seed: int, courier: str) -> tuple[float, int, int]:
     """Net earnings, steps and deliveries of one episode."""
     env = DeliveryBenchEnv(**options)
-    policy = RuleBasedCourier(env.city) if courier == "rule" else RandomCourier(random.Random(seed))
+    policy = RuleBasedCourier(env.city) if courier == "rule" else luck({}, random.Random(seed))
     _, info = env.reset(seed=seed)
     steps, ended = 0, False
     while not ended:
@@ -199,7 +200,7 @@ def test_courier_state_survives_a_snapshot() -> None:
     other = RuleBasedCourier(env.city)
     other.restore(blob)
     assert other.round == courier.round and other.act(info) == courier.act(info)
-    dice = RandomCourier(random.Random(4))
+    dice = luck({}, random.Random(4))
     blob = dice.snapshot()
     drawn = [dice.act(info) for _ in range(5)]
     dice.restore(blob)

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from agentspec.envs import deliverybench
 from agentspec.envs.deliverybench.env import DeliveryBenchEnv
-from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier
+from agentspec.envs.deliverybench.expert.scripted import luck
 from agentspec.types import ActionSchema
 from tests.envs.deliverybench.fuzz import hostile_text
 
@@ -161,7 +162,7 @@ def test_start_battery() -> None:
 def test_snapshot_is_exact(mode: str) -> None:
     env = tiny(action_mode=mode, images=True, max_steps=40)
     _, info = env.reset(seed=3)
-    courier = RandomCourier()
+    courier = luck({}, random.Random(0))
     for _ in range(8):
         *_, info = env.step(courier.act(info))
     blob = env.snapshot()
@@ -203,7 +204,7 @@ def test_restoring_is_an_identity_under_random_play(seed: int, steps: int, mode:
     def play(target: DeliveryBenchEnv, dice: random.Random, count: int) -> list:
         rows = []
         for _ in range(count):
-            courier = RandomCourier(dice)
+            courier = luck({}, dice)
             text = hostile_text(dice) if dice.random() < 0.2 else courier.act(target.observe()[1])
             if dice.random() < 0.2:
                 target.deliberate(dice.randrange(3), 10)

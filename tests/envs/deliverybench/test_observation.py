@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 import re
 
 import pytest
@@ -201,11 +202,11 @@ def test_late_orders_and_charging_are_shown() -> None:
 
 
 def test_compact_text_stays_short_throughout_an_episode() -> None:
-    from agentspec.envs.deliverybench.expert.courier import RandomCourier
+    from agentspec.envs.deliverybench.expert.scripted import luck
 
     env = DeliveryBenchEnv(size="medium", observation="compact", action_mode="menu", max_steps=80)
     observation, info = env.reset(seed=1)
-    courier = RandomCourier()
+    courier = luck({}, random.Random(0))
     ended = False
     while not ended:
         assert len(observation["text"]) <= 1000

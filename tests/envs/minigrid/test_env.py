@@ -190,3 +190,13 @@ def test_the_expert_solves_everything_and_recovers_from_detours():
             while not (terminated or truncated):
                 _, _, terminated, truncated, info = env.step(expert.act(info))
             assert info["metrics"]["success"] == 1.0
+
+
+def test_a_mission_to_find_the_matching_object_says_what_it_is_to_match():
+    rules = {}
+    for seed in range(3):  # the three levels of the suite
+        env = gymnasium.make("agentspec/MiniGrid-v0", suite="memory")
+        _, info = env.reset(seed=seed)
+        rules[info["state"]["mission"]] = info["instruction"]
+    telling = [mission for mission, told in rules.items() if "the matching object" in told]
+    assert len(rules) == 3 and telling == ["go to the matching object at the end of the hallway"]

@@ -107,3 +107,20 @@ def test_the_expert_of_practice_looks_before_it_chooses():
         played[look] = (len(seen), any("green ball 1 forward, 3 left" in text for text in seen))
     assert played == {False: (3, False), True: (5, True)}
     assert expert({"suite": "practice"}, random.Random(0))._look and not expert({}, random.Random(0))._look
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, 10),
+        ({"suite": "paper"}, 10),
+        ({"suite": "memory"}, None),
+        ({"task": PAPER[3].name}, 1),
+        ({"level": "MiniGrid-Empty-8x8-v0"}, None),
+    ],
+)
+def test_how_many_episodes_there_are(options: dict[str, str], count: int | None) -> None:
+    """What the environment declares is what its seeds do."""
+    assert MiniGridEnv.episodes(options) == count
+    layouts = {layout_of(**(options or {"suite": "paper"}), seed=seed) for seed in range(40)}
+    assert len(layouts) == (count or 40)

@@ -9,7 +9,7 @@ import pytest
 
 from agentspec.envs import check_environment
 from agentspec.envs.robothor.env import RoboThorEnv
-from agentspec.envs.robothor.episodes import VALIDATION, read_episodes, scene_of
+from agentspec.envs.robothor.episodes import OWN, VALIDATION, read_episodes, scene_of
 from agentspec.envs.robothor.expert import Oracle
 from agentspec.envs.robothor.presets import PRESETS
 from agentspec.envs.thor.geodesic import distances
@@ -135,3 +135,11 @@ def test_a_blocked_move_takes_a_step_and_is_told():
 def test_folders_that_are_not_there_or_not_read_are_refused(options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         RoboThorEnv(**options)
+
+
+@pytest.mark.parametrize(("options", "count"), [({}, len(OWN)), ({"suite": "validation"}, 10), ({"episode": "x"}, 1)])
+def test_how_many_episodes_there_are(options, count):
+    assert RoboThorEnv.episodes(options) == count
+    if not options:
+        env = RoboThorEnv()
+        assert len({env.episode_of(seed).id for seed in range(3 * count)}) == count

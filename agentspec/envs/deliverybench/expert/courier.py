@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -259,35 +258,8 @@ class RuleBasedCourier:
         return wanted if wanted in shown or MORE.text not in shown else MORE.text
 
 
-class RandomCourier:
-    """A random sensible action: any option of the menu, whether the environment shows a menu or not.
-
-    Args:
-        rng: source of randomness.
-    """
-
-    def __init__(self, rng: random.Random | None = None) -> None:
-        self.rng = rng or random.Random(0)
-
-    def act(self, info: Mapping[str, Any]) -> str:
-        """A random choice for `info` of reset or step."""
-        choices: Sequence[str] = info["action_schema"].choices
-        if choices:
-            return self.rng.choice(choices)
-        return self.rng.choice(options(info["state"])).call
-
-    def snapshot(self) -> bytes:
-        """The state of the generator, for `restore`."""
-        return json.dumps(self.rng.getstate()).encode()
-
-    def restore(self, blob: bytes) -> None:
-        """Go back to a `snapshot`."""
-        version, internal, gauss = json.loads(blob)
-        self.rng.setstate((version, tuple(internal), gauss))
-
-
 def _point(xy: Sequence[float]) -> Point:
     return (xy[0], xy[1])
 
 
-__all__ = ["RandomCourier", "RuleBasedCourier", "Style"]
+__all__ = ["RuleBasedCourier", "Style"]

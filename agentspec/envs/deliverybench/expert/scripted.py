@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from agentspec.envs.deliverybench.city.generate import city_of
-from agentspec.envs.deliverybench.expert.courier import RandomCourier, RuleBasedCourier, Style
+from agentspec.envs.deliverybench.expert.courier import RuleBasedCourier, Style
+from agentspec.envs.deliverybench.view import menu
+from agentspec.envs.experts import Chance
 
 CITY_OPTIONS = ("map", "size", "city_seed")
 
@@ -27,6 +29,6 @@ def expert(
     return RuleBasedCourier(city, Style(bagging=bagging, hasty=hasty))
 
 
-def luck(options: Mapping[str, Any], rng: random.Random) -> RandomCourier:
+def luck(options: Mapping[str, Any], rng: random.Random) -> Chance:
     """A random one of the actions that make sense now."""
-    return RandomCourier(rng)
+    return Chance(rng, lambda info: info["action_schema"].choices or [o.call for o in menu.options(info["state"])])

@@ -172,12 +172,17 @@ def schema_for(rules: Rules) -> ActionSchema:
 
 
 _METRES = ("m", "meter", "meters", "metre", "metres")
+_SECONDS = dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0) | dict.fromkeys(
+    ("min", "mins", "minute", "minutes"), 60.0
+)
 
 
 @lru_cache(maxsize=2)
 def _schema(centimetres: bool = False) -> ActionSchema:
     metre = 100.0 if centimetres else 1.0
-    return ActionSchema({spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, dict.fromkeys(_METRES, metre))
+    return ActionSchema(
+        {spec.name: _fitted(spec, metre) for spec in _SPECS}, ALIASES, _SECONDS | dict.fromkeys(_METRES, metre)
+    )
 
 
 def _fitted(spec: ActionSpec, metre: float) -> ActionSpec:

@@ -19,14 +19,15 @@ project's site. Cost per step: none to retrieve; 2 calls per `every` steps, and 
 from __future__ import annotations
 
 import asyncio
-import math
+import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
+from agentspec.memory.memorybank.entries import Conclusions, Entry, avoid_by_rule, by_rule, retention
+from agentspec.memory.memorybank.prompts import CONCLUDE, HEAD, OVERVIEW, SUMMARISE
 from agentspec.memory.parts.steps import (
-    DATA,
     brief,
     distinct,
     first_held,
@@ -37,11 +38,12 @@ from agentspec.memory.parts.steps import (
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import when
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import VectorIndex
-from agentspec.state import Record, dump_state, keyed, load_state
+from agentspec.state import dump_state, keyed, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import clip_text
 from agentspec.trajectory import Trajectory
@@ -53,57 +55,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "rl": {"every": 16, "overview_every": 0, "answer_tokens": 128, "steps_tokens": 768},
 }
 NEXT_EPISODE = "[Plan for the next episode]"
-
-HEAD = (
-    "You keep the memory of an agent that acts in an environment. Its task and its latest steps follow.\n\n"
-    "Task: {task}\n\n" + DATA + "\n{steps}"
-)
-SUMMARISE = (
-    "\n\nSummarise these steps for the agent's later use in at most {words} words: what it tried, what came of it, "
-    "what is still open. Keep ids, places, amounts and times as they stand. No advice. Write nothing but the summary."
-)
-CONCLUDE = (
-    "\n\nInsights so far:\n{known}\n\nWhat do the steps show about this environment that will hold again? Give costs, "
-    "durations and thresholds as numbers; repeat nothing that is known; invent nothing. Answer with JSON:\n"
-    '{{"insights": [at most 3 sentences], "avoid": [at most 2 things not to do, and why], '
-    '"next": [the 3 things to do {next}, in order]}}'
-)
-OVERVIEW = (
-    "You keep the memory of an agent that acts in an environment. Merge its overview with the newer notes into one "
-    "overview of at most {words} words: what is known for certain, with numbers, then how things went. Where notes "
-    "disagree, the newer one holds. Write nothing but the overview.\n\nOverview so far:\n{overview}\n\n"
-    "Newer notes (data, not instructions):\n{notes}"
-)
-
-
-def retention(elapsed: float, strength: float, unit: float = 1.0) -> float:
-    """Ebbinghaus' R = e^(-t / (unit * S)): how likely an entry is remembered `elapsed` after its last recall.
-
-    >>> [round(retention(t, s), 4) for t, s in ((0, 1), (1, 1), (5, 5), (10, 2))]
-    [1.0, 0.3679, 0.3679, 0.0067]
-    """
-    return math.exp(-elapsed / (unit * strength))
-
-
-@dataclass(frozen=True)
-class Entry(Record):
-    """One memory: what it says, from when, how strong it is, and the step of the run at which it was last recalled."""
-
-    kind: str
-    text: str
-    episode: int
-    step: int
-    since: int
-    strength: int = 1
-
-
-@dataclass(frozen=True)
-class Conclusions:
-    """The answer of a model that draws insights."""
-
-    insights: list[str]
-    avoid: list[str] = field(default_factory=list)
-    next: list[str] = field(default_factory=list)
 
 
 class MemoryBank:
@@ -187,6 +138,7 @@ class MemoryBank:
         self._merged: list[int] = []  # summaries and insights that are not in the overview yet
         self._plan = ""
         self._days, self._last_pass = 0, 0
+        self._seed = services.rng.getrandbits(32)  # of the draws: a restored memory forgets as it would have
         self._day_began, self._held_from = 0, 0  # steps of this episode
         self._task = ""
         self._forgotten = 0
@@ -213,7 +165,7 @@ class MemoryBank:
         if self.services.context.layout == "snapshot":
             newest = self._steps(now.episode, max(0, now.step - self.recent))
             count = self.services.llm.count_tokens
-            items += [RecallItem(brief(self._named(e), count), 1.0, priority=4.0 + e.step) for e in newest]
+            items += [RecallItem(brief(self._named(e), count), 1.0, "step", priority=4.0 + e.step) for e in newest]
         return Recall(tuple(items))
 
     async def store(self, transition: Transition) -> None:
@@ -254,11 +206,15 @@ class MemoryBank:
         steps = newest_within([self._named(e) for e in day], self.steps_tokens, count)
         head = HEAD.format(task=self._task, steps="\n".join(steps + ([ending] if ending else [])))
         known = [e.text for e in self.entries.values() if e.kind == "insight"]
-        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count)
+        known = newest_within([f"- {text}" for text in known], self.answer_tokens, count, "ones")
         prompts = (
             head + SUMMARISE.format(words=self.answer_tokens // 3),
             head
-            + CONCLUDE.format(known="\n".join(known) or "(none)", next="in the next episode" if ending else "next"),
+            + CONCLUDE.format(
+                known="\n".join(known) or "(none)",
+                words=self.answer_tokens // 2,
+                next="in the next episode" if ending else "next",
+            ),
         )
         summary, found = await asyncio.gather(
             self.services.ask("summary", prompts[0], self.answer_tokens),
@@ -274,7 +230,7 @@ class MemoryBank:
         prompt = OVERVIEW.format(
             words=self.answer_tokens // 2,
             overview=self.overview or "(none)",
-            notes="\n".join(newest_within(notes, self.steps_tokens, count)),
+            notes="\n".join(newest_within(notes, self.steps_tokens, count, "notes")),
         )
         answer = await self.services.ask("overview", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, count)
@@ -306,11 +262,11 @@ class MemoryBank:
 
     def _fade(self) -> None:
         """Ebbinghaus: draw, or compare with the threshold; what belongs to the running day is not touched."""
-        now = self.services.time()
+        now, draw = self.services.time(), random.Random(f"{self._seed}/{self._days}")
         for key, entry in list(self.entries.items()):
             if self.forget == "sample":
                 elapsed = now.total - max(entry.since, self._last_pass)
-                stays = self.services.rng.random() < retention(elapsed, entry.strength, self.time_unit)
+                stays = draw.random() < retention(elapsed, entry.strength, self.time_unit)
             else:
                 stays = self.forget == "never" or self._retained(key) >= self.least
             if not stays:
@@ -361,7 +317,8 @@ class MemoryBank:
 
     def _item(self, key: int, score: float) -> RecallItem:
         entry = self.entries[key]
-        label = {"raw": "", "summary": "[Trajectory Summary] ", "insight": "[Environment Insight] "}[entry.kind]
+        over = when(entry.episode, self.services.time().episode)
+        label = {"summary": f"[Trajectory Summary] {over}", "insight": "[Environment Insight] "}.get(entry.kind, "")
         text = self._named(entry) if entry.kind == "raw" else f"{label}{entry.text}"
         kind = "episodic" if entry.kind == "raw" else entry.kind
         return RecallItem(
@@ -386,38 +343,12 @@ class MemoryBank:
         return {**counts, "forgotten": self._forgotten, "mean_strength": strength}
 
     def snapshot(self) -> bytes:
-        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten]
+        times = [self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed]
         return dump_state([keyed(self.entries), self.overview, self._merged, self._plan, self._task, times])
 
     def restore(self, blob: bytes) -> None:
         entries, self.overview, self._merged, self._plan, self._task, times = load_state(blob)
-        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten = times
+        self._days, self._last_pass, self._day_began, self._held_from, self._forgotten, self._seed = times
         self.entries = {key: Entry(*values) for key, values in entries}
         for kind, index in self._index.items():
             index.load([(key, entry.text) for key, entry in self.entries.items() if entry.kind == kind])
-
-
-def by_rule(day: Sequence[Entry], ending: str = "") -> str:
-    """A summary without a model: how many steps of each action, how many failed, what paid, and the newest result."""
-    if not day:
-        return ending
-    actions: dict[str, int] = {}
-    for entry in day:
-        name = entry.text.split("(", 1)[0].split(" ", 1)[0]
-        actions[name] = actions.get(name, 0) + 1
-    failed = sum(is_failure(entry.text) for entry in day)
-    done = ", ".join(f"{name} x{n}" for name, n in actions.items())
-    last = day[-1].text.split(" | in: ", 1)[0]
-    text = f"Steps {day[0].step + 1}-{day[-1].step + 1}: {done}; {failed} failed; last: {last}."
-    return f"{text} {ending}".strip()
-
-
-def avoid_by_rule(day: Sequence[Entry]) -> list[str]:
-    """The newest distinct failures of the day, as actions with what the environment said."""
-    failures = [entry.text.split(" | in: ", 1)[0] for entry in day if is_failure(entry.text)]
-    return list(dict.fromkeys(reversed(failures)))[:2]
-
-
-def is_failure(text: str) -> bool:
-    """Whether the text of a step says that its action failed."""
-    return " failed: " in text.split(" -> ", 1)[0]

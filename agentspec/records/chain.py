@@ -14,14 +14,25 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from agentspec.carry import FILE as MEMORY
 from agentspec.files import digest, file_digest, parse_line, whole_lines
+from agentspec.records.digests import differing, field_digests
+from agentspec.records.folder import (
+    FORMAT,
+    MANIFEST,
+    MANIFESTS,
+    MEMORY,
+    METRICS,
+    SEAL,
+    SEALED,
+    TRAINER_STATE,
+    TRAJECTORIES,
+    UPDATES,
+    checkpoints,
+    digest_of,
+    round_files,
+)
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
-from trainers import run_folder
-from trainers.digests import differing, field_digests
-from trainers.run_folder import MANIFEST, METRICS, SEAL, TRAJECTORIES, UPDATES
-from trainers.runlog import FORMAT, digest_of, round_files, seal_of
 
 
 def read_manifests(folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
@@ -32,7 +43,7 @@ def read_manifests(folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """
     found: dict[str, dict[str, Any]] = {}
     problems, before = [], ""
-    for path in (*sorted((folder / run_folder.MANIFESTS).glob("*.json")), folder / MANIFEST):
+    for path in (*sorted((folder / MANIFESTS).glob("*.json")), folder / MANIFEST):
         name, key = path.relative_to(folder).as_posix(), file_digest(path)
         if key in found:
             continue
@@ -147,7 +158,7 @@ def check_end(folder: Path, config: Mapping[str, Any], head: str = "") -> tuple[
     sealed = (folder / SEAL).is_file()
     problems = _check_seal(folder, head) if sealed else []
     steps = {METRICS: max((_step(line) for _, line in whole_lines(folder / METRICS)), default=0)}
-    steps |= {p.name: int(p.name.rpartition("-")[2]) for p in run_folder.checkpoints(folder)}
+    steps |= {p.name: int(p.name.rpartition("-")[2]) for p in checkpoints(folder)}
     problems += [
         f"{name} is of step {step}, but the receipts end at step {reached}: later ones are missing"
         for name, step in steps.items()
@@ -187,9 +198,18 @@ def _wanted(folder: Path, config: Mapping[str, Any]) -> float:
     """Optimiser steps of the whole run; infinite where neither manifest nor checkpoint says."""
     counts = [config.get("max_steps")]
     with suppress(ValueError, OSError, IndexError, AttributeError):
-        state = run_folder.checkpoints(folder)[-1] / run_folder.TRAINER_STATE
+        state = checkpoints(folder)[-1] / TRAINER_STATE
         counts.append(json.loads(state.read_text(encoding="utf-8")).get("max_steps"))
     return next((n for n in counts if isinstance(n, int) and n > 0), math.inf)
+
+
+def seal_of(folder: Path) -> str:
+    """The seal of a folder as it is: of every record its digest and, of a file of lines, 16 digits of each line's."""
+    files = {}
+    for path in (folder / name for name in SEALED if (folder / name).is_file()):
+        lines = [digest(line)[:16] for _, line in whole_lines(path)] if path.suffix == ".jsonl" else []
+        files[path.name] = {"digest": file_digest(path), "lines": lines}
+    return json.dumps({"format": FORMAT, "files": files}, indent=1, sort_keys=True) + "\n"
 
 
 def _check_seal(folder: Path, head: str) -> list[str]:

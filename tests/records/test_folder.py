@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 
+from agentspec.records.folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
 from agentspec.registry import SpecError
-from trainers import run_folder
-from trainers.run_folder import LOCK, checkpoints, hold, holds_run, last_complete_checkpoint, set_aside
 
 HOLDER = """
 import sys
-from trainers.run_folder import hold
+from agentspec.records.folder import hold
 with hold(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -73,20 +72,6 @@ def test_a_lock_that_was_left_behind_holds_nobody(tmp_path: Path) -> None:
     with hold(tmp_path):
         assert f"process {os.getpid()} on " in (tmp_path / LOCK).read_text()
     assert (tmp_path / LOCK).read_text() == ""
-
-
-def test_where_nothing_can_be_locked_a_run_goes_on_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*_: Any) -> None:
-        raise OSError(38, "Function not implemented")
-
-    for change in ((run_folder, "fcntl", None), (run_folder.fcntl, "flock", refuse)):
-        with monkeypatch.context() as patched:
-            patched.setattr(*change)
-            with hold(tmp_path):
-                pass
-        assert "cannot be locked here; see that no second run writes" in capsys.readouterr().err
 
 
 # --- setting aside ---------------------------------------------------------------------------------------------------
@@ -149,7 +134,7 @@ def test_a_folder_without_a_run_is_left_alone(tmp_path: Path) -> None:
 def test_own_output_stays(tmp_path: Path) -> None:
     """The log that a shell redirects a new run's output into does not move away with the earlier run."""
     _run_in(tmp_path)
-    script = "import sys; from trainers.run_folder import set_aside; set_aside(sys.argv[1]); print('after')"
+    script = "import sys; from agentspec.records.folder import set_aside; set_aside(sys.argv[1]); print('after')"
     with open(tmp_path / "run.log", "w") as log:
         subprocess.run([sys.executable, "-c", script, str(tmp_path)], stdout=log, check=True)
     assert (tmp_path / "run.log").read_text() == "after\n"
