@@ -11,8 +11,10 @@ who shares a forward of the model with whom.
   depends on the work alone, never on timing, so that a run repeats whatever the arithmetic.
 
 Before it takes requests either way, the event loop is given a few turns, so that an episode that asks several things at
-once, or goes on at once, is complete. Requests are ordered by episode and number, and run in a worker thread while the
-loop goes on.
+once, or goes on at once, is complete. A continuous batch also gives those it has just answered a moment, at most a
+quarter of what its last step took, to act and ask again: episodes that were in step stay in step, and share their
+forwards. Where they took longer the last time, it does not wait. Requests are ordered by episode and number, and run in
+a worker thread while the loop goes on.
 
 An episode leaves when it ends; one that fails or is cancelled without saying so leaves when the task that entered it
 ends. Requests without an episode, or from an episode that never entered, wait for nobody. As a last resort, for
@@ -23,6 +25,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +36,8 @@ Batching = Literal["continuous", "closed"]
 """Who joins a running batch: see the module."""
 
 _TURNS = 4
+_SHARE = 0.25
+"""Of the duration of a step: how long a continuous batch waits for those it has just answered."""
 _POLL_S = 1.0
 
 
@@ -81,6 +86,9 @@ class Batcher(Generic[T]):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._driver: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
+        self._answered: dict[str, float] = {}  # live episodes that act now, and since when
+        self._awaited: set[str] = set()
+        self._pause_s = self._step_s = self._stepped = 0.0
         self._thread = concurrent.futures.ThreadPoolExecutor(max_workers=1, thread_name_prefix="agentspec-llm")
 
     def enter(self, episode: str) -> None:
@@ -98,6 +106,7 @@ class Batcher(Generic[T]):
 
     def leave(self, episode: str, *, every: bool = False) -> None:
         """The episode ended (``every``: however often it entered); unknown episodes are ignored."""
+        self._answered.pop(episode, None)
         count = self._live.pop(episode, 0)
         if count > 1 and not every:
             self._live[episode] = count - 1
@@ -111,6 +120,8 @@ class Batcher(Generic[T]):
         """
         self._adopt_loop()
         loop = asyncio.get_running_loop()
+        if (since := self._answered.pop(episode, None)) is not None:
+            self._pause_s = time.perf_counter() - since
         pending = _Pending(episode, number, job, loop.create_future())
         self._pending.append(pending)
         self._wake()
@@ -135,10 +146,18 @@ class Batcher(Generic[T]):
         """
         if self.batching == "closed" or self._working is None:
             return []
-        loop = self._working.loop
+        self._step_s = time.perf_counter() - self._stepped
+        try:
+            return self._ask(self._working, done)
+        finally:
+            self._stepped = time.perf_counter()
+
+    def _ask(self, batch: _Batch[T], done: Sequence[T]) -> list[T]:
+        """The worker's side of `exchange`."""
+        loop = batch.loop
         if not (done or self._pending or loop.is_closed()):
             return []
-        exchanging = self._exchange(self._working, done)
+        exchanging = self._exchange(batch, done)
         try:
             future = asyncio.run_coroutine_threadsafe(exchanging, loop)
         except RuntimeError:
@@ -157,7 +176,7 @@ class Batcher(Generic[T]):
         """The loop's side of `exchange`."""
         joining: list[_Pending[T]] = []
         if self._batch is batch and self._deliver(batch, done):
-            await _turns()
+            await self._regroup()
             if self._batch is batch:
                 joining = self._take(everybody=True)
                 batch.jobs += joining
@@ -174,11 +193,31 @@ class Batcher(Generic[T]):
         left = [p for p in batch.jobs if id(p.job) not in finished]
         if not left:
             return False
-        for p in batch.jobs:
-            if id(p.job) in finished:
-                _settle(p.done, None)
+        self._settle_all([p for p in batch.jobs if id(p.job) in finished], None)
         batch.jobs = left
         return True
+
+    def _settle_all(self, answered: Sequence[_Pending[T]], error: BaseException | None) -> None:
+        """Deliver; those who have nothing else under way may ask again soon."""
+        for p in answered:
+            _settle(p.done, error)
+        busy = {p.episode for p in [*self._pending, *(self._batch.jobs if self._batch else ())] if not p.done.done()}
+        self._awaited = {p.episode for p in answered if p.episode in self._live} - busy
+        self._answered |= dict.fromkeys(self._awaited, time.perf_counter())
+
+    async def _regroup(self) -> None:
+        """Give those just answered, and those who ask several things, time to ask."""
+        await _turns()
+        limit = _SHARE * self._step_s
+        end = time.perf_counter() + limit
+        while self._pause_s < limit and self._awaited & self._answered.keys():
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), end - time.perf_counter())
+            except TimeoutError:
+                break
+        self._awaited = set()
+        await _turns()
 
     def _task_ended(self, episode: str, live: dict[str, int], _: object) -> None:
         if self._live is live:
@@ -193,6 +232,7 @@ class Batcher(Generic[T]):
             self._live = {}
         self._loop, self._pending, self._driver, self._batch = loop, [], None, None
         self._changed = asyncio.Event()
+        self._answered, self._awaited = {}, set()
 
     def _wake(self) -> None:
         if self._loop is None or self._loop.is_closed():
@@ -205,7 +245,7 @@ class Batcher(Generic[T]):
         """Run batches while anybody asks."""
         while self._pending:
             if self.batching == "continuous":
-                await _turns()
+                await self._regroup()
                 jobs = self._take(everybody=True)
             else:
                 patient = await self._wait(self._may_start)
@@ -227,11 +267,11 @@ class Batcher(Generic[T]):
         finally:
             if self._batch is batch:
                 self._batch = None
-            for p in batch.jobs:
-                _settle(p.done, error)
+            self._settle_all(batch.jobs, error)
 
     def _work(self, batch: _Batch[T]) -> None:
         self._working = batch
+        self._stepped = time.perf_counter()
         self._run([p.job for p in batch.jobs])
 
     async def _wait(self, enough: Callable[[], bool]) -> bool:

@@ -19,7 +19,7 @@ import torch
 from agentspec.llm.base import user
 from agentspec.llm.batching import Batching
 from agentspec.llm.local import LocalLLM, probe
-from agentspec.llm.local.attention import Segment, slot_block
+from agentspec.llm.local.attention import Segment
 from agentspec.llm.local.cache import Slot
 from agentspec.llm.local.forward import PackedModel
 from agentspec.llm.local.invariance import InvariantModules, elementwise
@@ -53,7 +53,7 @@ def adapted(model: Any, rank: int = 16, **config: Any) -> Any:
 
 def read(model: PackedModel, text: list[int], draw: random.Random, logits: int) -> torch.Tensor:
     """The last ``logits`` logits of ``text``, read in random pieces beside other texts."""
-    ours, other = (Slot(model.layers, len(text), slot_block(model.device)) for _ in range(2))
+    ours, other = (Slot(model.layers, len(text)) for _ in range(2))
     start, beside, found = 0, 0, []
     with model.session(), model.adapter(""):
         while start < len(text):
@@ -75,7 +75,7 @@ def check_reading(model: Any, length: int, trials: int, seed: int = 0) -> None:
     packed.check()
     draw = random.Random(seed)
     text = [draw.randrange(len(model.get_input_embeddings().weight)) for _ in range(length)]
-    slot = Slot(packed.layers, length, slot_block(packed.device))
+    slot = Slot(packed.layers, length)
     with packed.session(), packed.adapter(""):
         (whole,) = packed.forward([Segment(slot, text, 0, 40)])
     for _ in range(trials):

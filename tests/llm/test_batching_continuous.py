@@ -128,6 +128,48 @@ def test_a_continuous_batch_waits_for_nobody() -> None:
     assert {"a1 c0", "a2 c0"} <= set(machine.steps)
 
 
+@pytest.mark.parametrize("share", [0.0, 1e9])
+def test_those_answered_together_ask_together_however_many_turns_their_acting_takes(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as there is time; without any they drift apart for good."""
+    monkeypatch.setattr("agentspec.llm.batching._SHARE", share)
+    machine = Steps("continuous")
+
+    async def acting(name: str, turns: int) -> None:
+        machine.batcher.enter(name)
+        try:
+            for i in range(3):
+                await machine.batcher.submit(name, i, f"{name}{i}:2")
+                for _ in range(turns * i):
+                    await asyncio.sleep(0)
+        finally:
+            machine.batcher.leave(name)
+
+    async def main() -> None:
+        await asyncio.gather(acting("a", 0), acting("b", 40), acting("c", 90))
+
+    run(main())
+    together = machine.steps == [f"a{i} b{i} c{i}" for i in (0, 0, 1, 1, 2, 2)]
+    assert together == (share > 0)
+
+
+def test_an_episode_that_has_more_under_way_or_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agentspec.llm.batching._SHARE", 1e9)
+    machine = Steps("continuous")
+
+    async def several() -> None:
+        machine.batcher.enter("a")
+        await asyncio.gather(*(machine.batcher.submit("a", i, f"a{i}:{2 * i + 1}") for i in range(2)))
+        machine.batcher.leave("a")
+
+    async def main() -> None:
+        await asyncio.gather(several(), play(machine.batcher, "b", [2, 1, 3]))
+
+    run(main())
+    assert machine.steps == ["a0 a1 b0", "a1 b0", "a1 b1", "b2", "b2", "b2"]
+
+
 def test_what_one_episode_asks_at_once_is_answered_as_it_is_finished() -> None:
     machine = Steps("continuous")
     answered: list[str] = []

@@ -5,13 +5,14 @@ segment's new keys and values are stored in its slot, and its queries attend to 
 key-value head are laid side by side as more queries of that head, so that keys and values are read once and never
 repeated.
 
-On a CPU segments go one by one, each against whole blocks of keys of which those to come are hidden: then the order in
-which a token's keys are summed up depends on its position alone, not on how many tokens are read at once. torch's
-kernel takes queries in blocks of 32 (64, 256 for more), and MKL multiplies the rows of a last block of fewer than 4 by
-other kernels: such a block is filled up to 4. And a single head would be multiplied by all threads together, in pieces
-that depend on the number of queries: it is given to the kernel as several. So the same token in the same context is the
-same, bit for bit, whoever else is in the batch (`agentspec.llm.local.invariance`). On an accelerator, where a launch
-costs more than the work, the segments of one token (sequences that are writing) are gathered into one padded batch.
+On a CPU segments go one by one, each against blocks of keys of which those to come are hidden
+(`agentspec.llm.local.blocks`): then the order in which a token's keys are summed up depends on its position alone, not
+on how many tokens are read at once. torch's kernel takes queries in blocks of 32 (64, 256 for more), and MKL multiplies
+the rows of a last block of fewer than 4 by other kernels: such a block is filled up to 4. And a single head would be
+multiplied by all threads together, in pieces that depend on the number of queries: it is given to the kernel as
+several. So the same token in the same context is the same, bit for bit, whoever else is in the batch
+(`agentspec.llm.local.invariance`). The queries of segments of one token (sequences that are writing) are laid out
+together; on an accelerator, where a launch costs more than the work, the keys are too, in one padded batch.
 """
 
 from __future__ import annotations
@@ -26,21 +27,15 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 
 from agentspec.llm.base import LLMError
+from agentspec.llm.local.blocks import padded
 from agentspec.llm.local.cache import Slot
 from agentspec.llm.local.invariance import MIN_ROWS, elementwise
 
 _ACTIVE = threading.local()
 _BATCHED_FROM = {"cpu": 1 << 30}
 _BATCHED_FROM_DEFAULT = 4
-_KEYS = {"cpu": 512}
-"""Keys that torch's attention kernel takes at a time."""
 _QUERIES = {"cpu": 32}
-"""Queries that it takes at a time, or a divisor of them."""
-
-
-def slot_block(device: torch.device) -> int:
-    """What the capacity of slots on ``device`` must be a multiple of."""
-    return _KEYS.get(device.type, 64)
+"""Queries that torch's attention kernel takes at a time, or a divisor of them."""
 
 
 @dataclass
@@ -67,20 +62,25 @@ class Segment:
 
 @dataclass
 class Pack:
-    """The segments of one forward, where each lies in the row of tokens, and masks that all layers share."""
+    """The segments of one forward, where each lies in the row of tokens, and masks that all layers share.
+
+    ``last`` are the lengths that a last block of keys may have (`agentspec.llm.local.blocks`); empty: any.
+    """
 
     segments: Sequence[Segment]
     bounds: list[tuple[int, int]]
+    last: Sequence[int] = ()
     masks: dict[tuple[int, ...], torch.Tensor] = field(default_factory=dict)
 
-    def split(self, device: torch.device) -> tuple[list[int], list[int]]:
-        """Numbers of the segments to take one by one, and of those to take as one batch."""
+    def __post_init__(self) -> None:
         numbers = range(len(self.segments))
-        single = [i for i in numbers if len(self.segments[i].tokens) == 1 and self.segments[i].source is None]
-        if len(single) < _BATCHED_FROM.get(device.type, _BATCHED_FROM_DEFAULT):
-            return list(numbers), []
-        together = set(single)
-        return [i for i in numbers if i not in together], single
+        self.single = [i for i in numbers if len(self.segments[i].tokens) == 1 and self.segments[i].source is None]
+        together = set(self.single)
+        self.others = [i for i in numbers if i not in together]
+
+    def keys(self, total: int) -> int:
+        """How many keys to read so that the first ``total`` are among them."""
+        return padded(total, self.last) if self.last else total
 
 
 @dataclass(frozen=True)
@@ -132,43 +132,50 @@ def packed_attention(
     scores = _Scores(scaling, sliding_window or 0, softcap, s_aux)
     out = query.new_empty(1, query.shape[2], query.shape[1], value.shape[-1])
     out[:, pack.bounds[-1][1] :] = 0.0  # padding tokens attend to nothing
-    alone, together = pack.split(query.device)
-    for i in alone:
+    for i in pack.others:
         begin, end = pack.bounds[i]
         segment = pack.segments[i]
         if segment.source is not None and segment.start > segment.known:
             segment.slot.copy_layer(layer, segment.source, segment.known, segment.start)
         segment.slot.write(layer, segment.start, key[0, :, begin:end], value[0, :, begin:end])
-        out[0, begin:end] = _one(pack, segment, layer, query[:, :, begin:end], scores)
-    if together:
-        columns = torch.tensor([pack.bounds[i][0] for i in together], device=query.device)
-        segments = [pack.segments[i] for i in together]
+        out[0, begin:end] = _several(pack, [segment], layer, query[0, :, begin:end][None], scores)[0]
+    if pack.single:
+        columns = torch.tensor([pack.bounds[i][0] for i in pack.single], device=query.device)
+        segments = [pack.segments[i] for i in pack.single]
         for segment, k, v in zip(segments, key[0][:, columns].unbind(1), value[0][:, columns].unbind(1), strict=True):
             segment.slot.write(layer, segment.start, k[:, None], v[:, None])
-        out[0, columns] = _batch(pack, segments, layer, query[0][:, columns], scores)
+        queries = query[0][:, columns].transpose(0, 1)
+        if len(segments) < _BATCHED_FROM.get(query.device.type, _BATCHED_FROM_DEFAULT):
+            out[0, columns] = _several(pack, segments, layer, queries[:, :, None], scores)[:, 0]
+        else:
+            out[0, columns] = _batch(pack, segments, layer, queries, scores)
     return out, None
 
 
-def _one(pack: Pack, segment: Segment, layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
-    """One segment's queries (1, heads, n, size) to its slot; (n, heads, size)."""
-    heads, n = query.shape[1], query.shape[2]
-    total = segment.start + n
-    keys, values = segment.slot.layer(layer)
-    block = _KEYS.get(query.device.type, 1)
-    padded = min(-(-total // block) * block, segment.slot.capacity)
-    keys, values = keys[None, :, :padded], values[None, :, :padded]
-    kv_heads = keys.shape[1]
-    if kv_heads == 1 and query.device.type == "cpu":
+def _several(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Tensor, scores: _Scores) -> torch.Tensor:
+    """The queries (B, heads, n, size) of segments of n tokens, each to its slot in turn; (B, n, heads, size)."""
+    size, heads, n = query.shape[:3]
+    slots = [s.slot.layer(layer) for s in segments]
+    kv_heads = slots[0][0].shape[0]
+    if alone := kv_heads == 1 and query.device.type == "cpu":
         kv_heads = max(2, heads)
-        query, keys, values = (x.expand(1, kv_heads, -1, -1) for x in (query, keys, values))
+        query = query.expand(-1, kv_heads, -1, -1)
     groups = max(1, heads // kv_heads)
     rows = _query_rows(groups * n, query.device)
-    q = query.reshape(1, kv_heads, groups * n, -1)
+    q = query.reshape(size, kv_heads, groups * n, -1)
     if rows > groups * n:
         q = torch.nn.functional.pad(q, (0, 0, 0, rows - groups * n))
-    mask = _causal_mask(pack, n, total, padded, groups, rows, scores.window, q)
-    o = _attend(q, keys, values, mask, groups, n, scores)[:, :, : groups * n]
-    return o.reshape(-1, n, o.shape[-1])[:heads].transpose(0, 1)
+    attended = []
+    for i, (segment, slot) in enumerate(zip(segments, slots, strict=True)):
+        total = segment.start + n
+        read = pack.keys(total)
+        k, v = (x[None, :, :read] for x in slot)
+        if alone:
+            k, v = (x.expand(1, kv_heads, -1, -1) for x in (k, v))
+        mask = _causal_mask(pack, n, total, read, groups, rows, scores.window, q)
+        attended.append(_attend(q[i : i + 1], k, v, mask, groups, n, scores))
+    o = torch.cat(attended)[:, :, : groups * n]
+    return o.reshape(size, -1, n, o.shape[-1])[:, :heads].transpose(1, 2)
 
 
 def _query_rows(rows: int, device: torch.device) -> int:
@@ -196,21 +203,21 @@ def _batch(pack: Pack, segments: Sequence[Segment], layer: int, query: torch.Ten
 
 
 def _causal_mask(
-    pack: Pack, n: int, total: int, padded: int, groups: int, rows: int, window: int, like: torch.Tensor
+    pack: Pack, n: int, total: int, read: int, groups: int, rows: int, window: int, like: torch.Tensor
 ) -> torch.Tensor | None:
-    """Additive mask (rows, padded) of the last ``n`` of ``total`` positions, for ``groups`` times ``n`` queries and
+    """Additive mask (rows, read) of the last ``n`` of ``total`` positions, for ``groups`` times ``n`` queries and
     padding that sees everything; ``None`` if nothing is hidden.
     """
-    if n == 1 and padded == total and not 0 < window < total:
+    if n == 1 and read == total and not 0 < window < total:
         return None
     cached = pack.masks.get((n, total, groups, window))
     if cached is None:
         here = torch.arange(total - n, total, device=like.device)[:, None]
-        there = torch.arange(padded, device=like.device)[None]
+        there = torch.arange(read, device=like.device)[None]
         hidden = there > here
         if window:
             hidden |= there <= here - window
-        mask = torch.zeros(rows, padded, dtype=like.dtype, device=like.device)
+        mask = torch.zeros(rows, read, dtype=like.dtype, device=like.device)
         mask[: groups * n].masked_fill_(hidden.repeat(groups, 1), float("-inf"))
         cached = pack.masks[n, total, groups, window] = mask
     return cached

@@ -38,8 +38,9 @@ class LocalLLM:
         tokenizer: its Hugging Face tokenizer.
         name: model name in the records.
         max_batch: samples that run at once.
-        max_cache_tokens: token positions kept in the prefix cache; one costs
-            `2 * layers * key_value_heads * head_size` numbers.
+        max_cache_tokens: token positions that the prefix cache and the samples that run at once hold together; one
+            costs `2 * layers * key_value_heads * head_size` numbers (SmolLM2-135M in float32: 46 kB, so 3 GB by
+            default). Samples beyond it wait; a single one may need more, and so may answers of more than 64 tokens.
         max_context: context window; by default the model's.
         template_kwargs: variables of the chat template, e.g. `{"enable_thinking": False}`.
         patience_s: see `agentspec.llm.batching.Batcher`.

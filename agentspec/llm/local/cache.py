@@ -8,8 +8,8 @@ them:
 - any other slot (the same static prompt in another episode, another module's view of this episode) is *copied* up to
   the common prefix. Copying a token costs about a hundredth of computing it.
 
-The least recently used slots go first when the bound on tokens is passed. Adapters share the bound, and nothing else:
-keys and values that one adapter computed are never found by another.
+The least recently used slots go first when the bound on tokens is passed, which running calls count towards. Adapters
+share the bound, and nothing else: keys and values that one adapter computed are never found by another.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ class Match:
 
 
 class PrefixCache:
-    """Slots of finished calls, found by prefix, bounded by ``max_tokens`` positions (live calls count too); a slot's
-    capacity is a multiple of ``block``.
+    """Slots of finished calls, found by prefix; with those of running calls they hold ``max_tokens`` positions at most,
+    as long as the running ones leave room. A slot's capacity is a multiple of ``block``.
     """
 
     def __init__(self, layers: int, max_tokens: int, block: int = 64) -> None:
@@ -114,6 +114,7 @@ class PrefixCache:
         self.block = block
         self.max_tokens = max_tokens
         self._slots: list[Slot] = []
+        self._running: set[Slot] = set()
         self._clock = 0
         self._epoch = 0
         self._lock = threading.Lock()
@@ -123,8 +124,13 @@ class PrefixCache:
 
     @property
     def tokens(self) -> int:
-        """Positions held (capacity of all slots)."""
-        return sum(s.capacity for s in self._slots)
+        """Positions held: the capacity of all slots, those of running calls among them."""
+        return self.running + sum(s.capacity for s in self._slots)
+
+    @property
+    def running(self) -> int:
+        """Positions that running calls hold."""
+        return sum(s.capacity for s in self._running)
 
     def clear(self) -> None:
         """Forget everything, also what calls that are running now will bring back: the weights changed."""
@@ -139,15 +145,12 @@ class PrefixCache:
                 if slot.owner == owner:
                     slot.owner = None
 
-    def assign(
-        self, prompts: Sequence[tuple[Sequence[int], int, str, int]], adapter: str = "", live: int = 0
-    ) -> list[Slot]:
-        """One slot per row, with the longest known prefix in place.
+    def assign(self, prompts: Sequence[tuple[Sequence[int], int, str, int]], adapter: str = "") -> list[Slot]:
+        """One slot per row, with the longest known prefix in place; each comes back by `put` or `drop`.
 
         Args:
             prompts: per row the tokens, the longest prefix that may be reused, the episode, and the capacity needed.
             adapter: the adapter that computes them.
-            live: positions that running calls hold.
 
         Returns:
             Slots, no longer in the cache, in the order of the rows.
@@ -162,6 +165,8 @@ class PrefixCache:
                 slot = match.slot
                 if slot is not None and slot not in taken.values() and self._may_continue(slot, match.length, owner):
                     taken[i] = slot
+            # Others make room first; those that are copied from were matched just now and go last.
+            self._trim(sum(_round_up(p[3], self.block) for i, p in enumerate(prompts) if i not in taken))
             found: list[Slot] = []
             for i, (match, (_, _, _, capacity)) in enumerate(zip(matches, prompts, strict=True)):
                 slot = taken.get(i) or Slot(self.layers, capacity, self.block)
@@ -169,17 +174,20 @@ class PrefixCache:
                     slot.copy_prefix(match.slot, match.length)
                 found.append(slot)
             for i, slot in taken.items():
-                self._slots.remove(slot)
+                if slot in self._slots:
+                    self._slots.remove(slot)
                 slot.length = matches[i].length
             for slot, (_, _, owner, capacity) in zip(found, prompts, strict=True):
                 slot.reserve(capacity)
                 slot.owner, slot.adapter, slot.epoch = owner, adapter, self._epoch
-            self._trim(live + sum(s.capacity for s in found))
+            self._running.update(found)
+            self._trim()
             return found
 
     def put(self, slot: Slot, tokens: Sequence[int]) -> None:
         """Keep a slot; ``tokens`` are those whose keys and values it holds."""
         with self._lock:
+            self._running.discard(slot)
             if slot.epoch != self._epoch or not tokens:
                 return
             slot.length = len(tokens)
@@ -187,7 +195,22 @@ class PrefixCache:
             self._clock += 1
             slot.used = self._clock
             self._slots.append(slot)
-            self._trim(0)
+            self._trim()
+
+    def drop(self, slot: Slot) -> None:
+        """A slot that is not kept."""
+        with self._lock:
+            self._running.discard(slot)
+
+    def drop_running(self) -> None:
+        """No call runs any more."""
+        with self._lock:
+            self._running.clear()
+
+    def trim(self) -> None:
+        """Hold the bound: running calls may have grown."""
+        with self._lock:
+            self._trim()
 
     def _match(self, prompt: np.ndarray, owner: str, adapter: str) -> Match:
         best, rank = Match(), (0, 0)
@@ -208,8 +231,9 @@ class PrefixCache:
         """In place only if it costs no other live episode its context, and this one not most of a longer context."""
         return slot.owner in (None, owner) and slot.length - length <= length
 
-    def _trim(self, live: int) -> None:
-        total = live + self.tokens
+    def _trim(self, more: int = 0) -> None:
+        """Forget the least recently used, so that ``more`` positions have room."""
+        total = self.tokens + more
         if total <= self.max_tokens:
             return
         for slot in sorted(self._slots, key=lambda s: s.used):

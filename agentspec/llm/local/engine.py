@@ -18,7 +18,6 @@ from itertools import pairwise
 import torch
 
 from agentspec.llm.local.adapters import active_adapter
-from agentspec.llm.local.attention import slot_block
 from agentspec.llm.local.cache import PrefixCache
 from agentspec.llm.local.forward import PackedModel, Segment
 from agentspec.llm.local.invariance import version
@@ -45,7 +44,7 @@ class Engine:
         stop_ids: tokens that end a completion.
         decode: token ids to text.
         max_batch: rows that run at once.
-        max_cache_tokens: bound of the prefix cache.
+        max_cache_tokens: bound of the prefix cache, and of what rows that run at once need.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class Engine:
         max_cache_tokens: int,
     ) -> None:
         self.model = model
-        self.cache = PrefixCache(model.layers, max_cache_tokens, slot_block(model.device))
+        self.cache = PrefixCache(model.layers, max_cache_tokens)
         self._stop_ids = stop_ids
         self._decode = decode
         self._max_batch = max_batch
@@ -74,13 +73,18 @@ class Engine:
         """
         self.model.check()
         self._forget_old_weights()
-        scheduler = Scheduler(self._max_batch, active_adapter(self.model.model), self._stop_ids, self._decode)
+        bounds = self._max_batch, self.cache.max_tokens
+        adapter = active_adapter(self.model.model)
+        scheduler = Scheduler(*bounds, self._room, adapter, self._stop_ids, self._decode)
         scheduler.add(jobs)
         with self.model.session():
-            while scheduler.jobs:
-                self._run_adapter(scheduler, exchange)
-                # Some needed no forward.
-                scheduler.add(exchange(scheduler.collect()))
+            try:
+                while scheduler.jobs:
+                    self._run_adapter(scheduler, exchange)
+                    # Some needed no forward.
+                    scheduler.add(exchange(scheduler.collect()))
+            finally:
+                self.cache.drop_running()
 
     def _run_adapter(self, scheduler: Scheduler, exchange: Exchange) -> None:
         """Forwards with one adapter, as long as it has its turn."""
@@ -102,13 +106,15 @@ class Engine:
                         self._finish(row, scheduler.running)
                 scheduler.add(exchange(scheduler.collect()))
 
+    def _room(self, row: Row) -> int:
+        return self.model.room(row.room)
+
     def _place(self, rows: Sequence[Row], running: Sequence[Row]) -> None:
         """Give each row a slot with what is known of it, and the row before it as the source of what they share."""
         if not rows:
             return
-        prompts = [(r.tokens, r.wanted, r.job.episode, r.room) for r in rows]
-        live = sum(r.slot.capacity for r in running)
-        for row, slot in zip(rows, self.cache.assign(prompts, rows[0].job.adapter, live), strict=True):
+        prompts = [(r.tokens, r.wanted, r.job.episode, self._room(r)) for r in rows]
+        for row, slot in zip(rows, self.cache.assign(prompts, rows[0].job.adapter), strict=True):
             row.slot = slot
             _copy_longest(row, running)
             row.computed = row.known = slot.length
@@ -130,6 +136,7 @@ class Engine:
             source = row.source.slot if row.source else None
             segments.append(Segment(row.slot, tokens, row.computed, wanted, source, row.known))
         outputs = self.model.forward(segments)
+        self.cache.trim()
         choosing: list[tuple[ChoiceRow, torch.Tensor]] = []
         writing: list[tuple[FreeRow, torch.Tensor]] = []
         for (row, n), logits in zip(step, outputs, strict=True):
@@ -152,15 +159,17 @@ class Engine:
         """Keep the first sample's keys and values; the others' differ in a few tokens only."""
         if self.model.recorder is not None and not isinstance(row, ScoreRow):
             self.model.recorder.keep(row.job.episode, row.tokens[: row.slot.length], row.slot.seen)
-        if row.index:
-            return
         for other in running:
             if other.source is row:
                 # From now on the slot may be continued by a row that joins.
                 other.slot.copy_prefix(row.slot, other.computed)
                 other.source, other.known = None, other.computed
-        length = len(row.job.prompt) if isinstance(row, ScoreRow) else row.slot.length
-        self.cache.put(row.slot, row.tokens[: min(length, row.slot.length)])
+        if row.index:
+            self.cache.drop(row.slot)
+        else:
+            length = len(row.job.prompt) if isinstance(row, ScoreRow) else row.slot.length
+            self.cache.put(row.slot, row.tokens[: min(length, row.slot.length)])
+        del row.slot  # its job may take longer
 
     def invalidate(self) -> None:
         """Forget keys, values and packed weights: the weights changed."""

@@ -22,18 +22,25 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
+from torch import nn
 
 from agentspec.llm.base import LLMError
 from agentspec.llm.local.adapters import active_adapter, using
-from agentspec.llm.local.attention import Pack, Segment, active, packed_attention, slot_block
+from agentspec.llm.local.attention import Pack, Segment, active, packed_attention
+from agentspec.llm.local.blocks import WHOLE, last_blocks, padded
 from agentspec.llm.local.cache import Slot
 from agentspec.llm.local.invariance import MIN_ROWS, InvariantModules
-from agentspec.llm.local.probe import is_batch_invariant
+from agentspec.llm.local.last_layer import feed_forward, only_at
+from agentspec.llm.local.probe import decoder_layers, is_batch_invariant
 from agentspec.llm.local.states import StateRecorder
 
 _ATTENTION = "agentspec_packed"
 _LAYER_TYPES = frozenset({"full_attention", "sliding_attention", "attention"})
 _MIN_ROWS = {"cpu": MIN_ROWS}
+_MULTIPLE = 8
+"""On a CPU, tokens of a longer forward are filled up to a multiple of this: oneDNN compiles and keeps a product for
+every number of rows (SmolLM2: 3 MB and 3 ms).
+"""
 
 
 class PackedModel:
@@ -63,6 +70,8 @@ class PackedModel:
         self.recorder: StateRecorder | None = None
         self._modules = InvariantModules(model)
         self._checked = False
+        self._whole_blocks = False
+        self._above: list[nn.Module] = []
         self._invariant: tuple[int, bool] | None = None
 
     @property
@@ -70,30 +79,43 @@ class PackedModel:
         """Where the model is now."""
         return next(self.model.parameters()).device
 
+    @property
+    def last_blocks(self) -> tuple[int, ...]:
+        """Lengths that the last block of keys may have (`agentspec.llm.local.blocks`); empty: any."""
+        if self.device.type != "cpu":
+            return ()
+        text = self.text_config
+        size = getattr(text, "head_dim", None) or text.hidden_size // text.num_attention_heads
+        return (WHOLE,) if self._whole_blocks else last_blocks(int(size), torch.get_num_threads())
+
+    def room(self, tokens: int) -> int:
+        """Positions that a slot needs to hold and attend to so many ``tokens``."""
+        return padded(tokens, last) if (last := self.last_blocks) else tokens
+
     def forward(self, segments: Sequence[Segment]) -> list[torch.Tensor]:
         """Run all segments, in order; per segment the float32 logits of its last ``logits`` positions, (logits, V).
 
         Slots are extended (``length``) by what was computed. Call inside `session` and `adapter`.
         """
-        device = self.device
-        least = _MIN_ROWS.get(device.type, 1)
+        device, last = self.device, self.last_blocks
         bounds: list[tuple[int, int]] = []
         tokens: list[int] = []
         positions: list[int] = []
         wanted: list[int] = []
         for s in segments:
-            s.slot.reserve(s.start + len(s.tokens))
+            stop = s.start + len(s.tokens)
+            s.slot.reserve(padded(stop, last) if last else stop)
             begin = len(tokens)
             tokens.extend(s.tokens)
             positions.extend(range(s.start, s.start + len(s.tokens)))
             bounds.append((begin, len(tokens)))
             wanted.extend(range(len(tokens) - s.logits, len(tokens)))
-        padding = [0] * (least - len(tokens))
+        padding = [0] * (_rows(len(tokens), device) - len(tokens))
         ids = torch.tensor([tokens + padding], device=device)
         # The head must compute something, even if nothing is wanted.
-        keep = torch.tensor(wanted + [0] * (max(least, 1) - len(wanted)), device=device)
+        keep = torch.tensor(wanted + [0] * (_rows(len(wanted), device) - len(wanted)), device=device)
         arguments = {"logits_to_keep": keep} if self._keeps else {}
-        with active(Pack(segments, bounds)):
+        with active(Pack(segments, bounds, last)), only_at(self._above, keep, ids.shape[1]):
             out = self.model(
                 input_ids=ids,
                 position_ids=torch.tensor([positions + padding], device=device),
@@ -112,6 +134,8 @@ class PackedModel:
     def session(self) -> Iterator[None]:
         """Evaluation mode, no gradients, our attention; everything as before at the end."""
         _register()
+        layers = decoder_layers(self.model, self.layers)
+        self._above = feed_forward(layers[-1]) if layers is not None else []
         configs = {}
         for module in self.model.modules():
             config: Any = getattr(module, "config", None)
@@ -147,7 +171,7 @@ class PackedModel:
         vocabulary = int(self.model.get_input_embeddings().weight.shape[0])
         tokens = [(7 * i * i + 3 * i + 1) % vocabulary for i in range(12)]
         with self.session(), self.adapter(""):
-            slots = [Slot(self.layers, 16, slot_block(self.device)) for _ in range(2)]
+            slots = [Slot(self.layers, 16) for _ in range(2)]
             packed = [
                 self.forward([Segment(slots[0], tokens[:5], 0)]),
                 # The rest of the first, packed beside a second sequence that copies its beginning.
@@ -178,8 +202,21 @@ class PackedModel:
         threads = torch.get_num_threads()
         if self._invariant is None or self._invariant[0] != threads:
             self.check()
-            self._invariant = threads, is_batch_invariant(self)
+            self._whole_blocks = False
+            found = is_batch_invariant(self)
+            if not found and self.device.type == "cpu":
+                self._whole_blocks = True
+                found = is_batch_invariant(self)
+            self._invariant = threads, found
         return self._invariant[1]
+
+
+def _rows(wanted: int, device: torch.device) -> int:
+    """Rows of a product that has to be made for so many tokens."""
+    least = _MIN_ROWS.get(device.type, 1)
+    if device.type != "cpu" or wanted <= least:
+        return least if wanted < least else wanted
+    return -(-wanted // _MULTIPLE) * _MULTIPLE
 
 
 @contextmanager

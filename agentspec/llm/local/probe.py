@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from agentspec.llm.local.attention import Segment, slot_block
+from agentspec.llm.local.attention import Segment
 from agentspec.llm.local.cache import Slot
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ _KNOWN: dict[Any, bool] = {}
 
 def is_batch_invariant(model: PackedModel) -> bool:
     """Whether `model` gives a token the same logits, keys and values, bit for bit, in whatever forward it is read."""
-    found = _KNOWN.get(signature := (str(model.config), _signature(model.model)))
+    found = _KNOWN.get(signature := (str(model.config), model.last_blocks, _signature(model.model)))
     if found is None:
         with model.session(), model.adapter(""), _first_layers(model) as layers:
             found = all(_agrees(model, cuts, seed, layers) for seed, cuts in enumerate(_CUTS))
@@ -51,7 +51,7 @@ def _agrees(model: PackedModel, cuts: Sequence[int], seed: int, layers: int) -> 
     vocabulary = int(model.model.get_input_embeddings().weight.shape[0])
     cuts = [cut for cut in cuts if cut <= model.max_context] or [model.max_context]
     text, other = ([draw.randrange(vocabulary) for _ in range(cuts[-1])] for _ in range(2))
-    whole, pieces, beside = (Slot(model.layers, len(text), slot_block(model.device)) for _ in range(3))
+    whole, pieces, beside = (Slot(model.layers, len(text)) for _ in range(3))
     start = strange = 0
     for cut in cuts:
         known = start
@@ -75,7 +75,7 @@ def _agrees(model: PackedModel, cuts: Sequence[int], seed: int, layers: int) -> 
 def _first_layers(model: PackedModel) -> Iterator[int]:
     """The model runs only its first layers inside, as many as show one of each kind; yields their number."""
     text = model.text_config
-    stack = _layers(model.model, model.layers)
+    stack = decoder_layers(model.model, model.layers)
     if stack is None:
         yield model.layers
         return
@@ -90,7 +90,7 @@ def _first_layers(model: PackedModel) -> Iterator[int]:
         text.num_hidden_layers = model.layers
 
 
-def _layers(model: nn.Module, count: int) -> nn.ModuleList | None:
+def decoder_layers(model: nn.Module, count: int) -> nn.ModuleList | None:
     """The stack of decoder layers, in models that run `layers[:config.num_hidden_layers]`."""
     stacks = [m for name, m in model.named_modules() if name.endswith(".layers") and isinstance(m, nn.ModuleList)]
     return next((m for m in stacks if len(m) == count), None)

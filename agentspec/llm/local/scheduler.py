@@ -12,18 +12,28 @@ class Scheduler:
 
     Args:
         max_rows: rows that run at once.
+        max_tokens: positions that rows running at once need (one row runs however many it needs).
+        room: positions that a row needs.
         adapter: the adapter of jobs that name none.
         stop_ids: tokens that end a completion.
         decode: token ids to text.
     """
 
     def __init__(
-        self, max_rows: int, adapter: str, stop_ids: frozenset[int], decode: Callable[[Sequence[int]], str]
+        self,
+        max_rows: int,
+        max_tokens: int,
+        room: Callable[[Row], int],
+        adapter: str,
+        stop_ids: frozenset[int],
+        decode: Callable[[Sequence[int]], str],
     ) -> None:
         self.jobs: list[tuple[Job, list[Row]]] = []
         self.running: list[Row] = []
         self._waiting: list[Row] = []
         self._max_rows = max_rows
+        self._max_tokens = max_tokens
+        self._room = room
         self._default = adapter
         self._stop_ids = stop_ids
         self._decode = decode
@@ -57,8 +67,14 @@ class Scheduler:
         adapter = self.adapter
         if self.running and any(r.job.adapter != adapter for r in self._waiting):
             return []
-        free = self._max_rows - len(self.running)
-        joining = [r for r in self._waiting if r.job.adapter == adapter][:free]
+        held = sum(r.slot.capacity for r in self.running)
+        joining: list[Row] = []
+        for row in [r for r in self._waiting if r.job.adapter == adapter]:
+            held += self._room(row)
+            count = len(self.running) + len(joining)
+            if count >= self._max_rows or (count and held > self._max_tokens):
+                break
+            joining.append(row)
         if joining:
             taken = set(map(id, joining))
             self._waiting = [r for r in self._waiting if id(r) not in taken]
