@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
+from agentspec.metrics import declared
 from agentspec.trajectory import Trajectory
 from agentspec.types import ActionError, Transition
 
@@ -67,7 +68,7 @@ def _outcome(t: Transition) -> str:
 def _end(trajectory: Trajectory) -> str:
     metrics, last = trajectory.metrics, trajectory.transitions[-1] if trajectory.transitions else None
     how = "the steps were used up" if last and last.truncated and not last.terminated else "played to its end"
-    names = ("success", "net_earnings", "deliveries", "goal_conditions_met", "goal_conditions_total")
+    names = dict.fromkeys(["success", *(m.name for m in declared(trajectory.task.env))])
     figures = [f"{n.replace('_', ' ')} {float(metrics[n]):g}" for n in names if metrics.get(n) is not None]
     return f"END: {how}; {', '.join(figures) or 'no figures'}."
 
