@@ -83,7 +83,9 @@ def test_a_transcript_shows_what_was_done_and_nothing_that_a_rule_found() -> Non
     episode = replayed(Task("minigrid", 0, level), ["FORWARD()"] * 3 + ["I give up"])
     text = transcript(episode)
     assert text.count("STEP ") == 4 and "DOES: I give up" in text and "ANSWER: went forward" in text
-    assert "ANSWER: failed: 'I give up' is not an action" in text and text.endswith("used up; success 0.")
+    assert "ANSWER: failed: 'I give up' is not an action" in text and text.endswith(
+        "used up; success 0, efficiency 0, reward 0."
+    )
     assert not any(leaf in text for leaf in LEAVES)
     rules = episode.transitions[0].input.instruction.splitlines()
     assert rules[0] in text and rules[0] not in transcript(episode, known=rules)

@@ -149,7 +149,7 @@ def test_short_moves_and_turns() -> None:
     do(w, 'TURN_AROUND(angle=90, direction="left")')
     do(w, 'TURN_AROUND(direction="right")')
     assert w.state.yaw == pytest.approx(0.0)
-    refuse(w, "TURN_AROUND(angle=[90])", "TA_BAD")
+    refuse(w, 'TURN_AROUND(direction="left")', "TA_BAD")
     refuse(w, 'TURN_AROUND(angle="much")', "PARSE_ARGS")  # told by the reader of answers, before it is a step's error
     refuse(w, "MOVE(1e9m, 0m)", "PARSE_ARGS")
 
