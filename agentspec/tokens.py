@@ -10,7 +10,6 @@ CUT = " ..."
 
 _PARTS = re.compile(r"\n\s*\n| \| ")
 _LEAST = 8
-_LABEL = 16  # signs of a line beside what it tells: "Last: turned left."
 
 CountTokens = Callable[[str], int]
 
@@ -72,16 +71,18 @@ def clip_text(text: str, budget: int, count_tokens: CountTokens = estimate_token
 def news(text: str, before: str, told: str = "") -> str:
     """What an observation says that the one before it did not: its lines less those that are unchanged.
 
-    A line is left out too if all it says is what was `told` of the action between them.
+    A line is left out too if all it says, after its label, is what was `told` of the action between them.
 
     >>> news("Find it.\\nLast: turned left.\\nIn front: a wall.", "Find it.\\nIn front: nothing.", "turned left")
     'In front: a wall.'
+    >>> news("Not done.", "", "done")
+    'Not done.'
     """
     known = {line.strip() for line in before.splitlines() if line.strip()}
-    told = told.strip()
+    again = told.strip().rstrip(".")
     lines = [line for line in text.splitlines() if line.strip() not in known]
-    if told:
-        lines = [line for line in lines if not (told in line and len(line.strip()) <= len(told) + _LABEL)]
+    if again:
+        lines = [line for line in lines if line.rpartition(": ")[2].strip().rstrip(".") != again]
     return "\n".join(lines).strip()
 
 

@@ -58,7 +58,7 @@ class BaseMemory:
             fresh = news(transition.input.text, *self._before)
             self._before = [transition.input.text, seen.feedback]
             if fresh:
-                line += f"\n   seen: {excerpt(fresh, self.observation_tokens, self.services.llm.count_tokens)}"
+                line += f"\n   before it: {excerpt(fresh, self.observation_tokens, self.services.llm.count_tokens)}"
         self._steps.append((line, "step" if seen.ok else "failure"))
 
     async def end_episode(self, trajectory: Trajectory) -> None:

@@ -61,7 +61,7 @@ def test_what_is_new_is_told_of_an_observation() -> None:
         told = [turn for turn in seen if "Mission:" in turn][-1]
         assert told.count("Mission: go to the matching object") <= 2  # of the first step, and of this one
         assert "In view: green key 2 forward, 1 right; green ball 1 forward, 3 left" in " ".join(told.split())
-        assert "turned left | Last: turned left" not in told and "seen: Last: turned left" not in told
+        assert "turned left | Last: turned left" not in told and "before it: Last: turned left" not in told
 
 
 def test_the_state_is_restored_with_what_is_told_of_it() -> None:
