@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Callable, Sequence
 
@@ -69,18 +70,19 @@ def clip_text(text: str, budget: int, count_tokens: CountTokens = estimate_token
 
 
 def news(text: str, before: str, told: str = "") -> str:
-    """What an observation says that the one before it did not: its lines less those that are unchanged.
+    """What an observation says that the one before it did not: the lines that a line-by-line difference adds.
 
     A line is left out too if all it says, after its label, is what was `told` of the action between them.
 
     >>> news("Find it.\\nLast: turned left.\\nIn front: a wall.", "Find it.\\nIn front: nothing.", "turned left")
     'In front: a wall.'
-    >>> news("Not done.", "", "done")
-    'Not done.'
+    >>> news("Not done.", "", "done"), news("- apple\\n- apple", "- apple")
+    ('Not done.', '- apple')
     """
-    known = {line.strip() for line in before.splitlines() if line.strip()}
+    old, new = before.splitlines(), text.splitlines()
     again = told.strip().rstrip(".")
-    lines = [line for line in text.splitlines() if line.strip() not in known]
+    steps = difflib.SequenceMatcher(None, old, new, autojunk=False).get_opcodes()
+    lines = [line for kind, _, _, begin, end in steps if kind != "equal" for line in new[begin:end]]
     if again:
         lines = [line for line in lines if line.rpartition(": ")[2].strip().rstrip(".") != again]
     return "\n".join(lines).strip()

@@ -41,7 +41,7 @@ def unit(config: Any) -> str:
 
 
 def run_recipe(main: Callable[[], None]) -> None:
-    """Run a recipe; an expected error is one line and exit code 2, Ctrl-C exit code 130."""
+    """Run a recipe; an expected error is one line and exit code 2, Ctrl-C exit code 130. Launched, it ends here."""
     from agentspec.cli.errors import expected_errors
 
     with expected_errors():
@@ -50,6 +50,6 @@ def run_recipe(main: Callable[[], None]) -> None:
         except KeyboardInterrupt:
             raise SystemExit(130) from None
         if "torch" in sys.modules:  # not for `--help`
-            from trainers.distributed import leave_group
+            from trainers.distributed import end_process
 
-            leave_group()
+            end_process()

@@ -107,8 +107,10 @@ def _unusable(call: LLMCall) -> str:
     return ""
 
 
-def leave_group() -> None:
-    """Leave the process group, if this process is in one, and end the process: the last thing a script does.
+def end_process() -> None:
+    """Where this process is in a group: leave it and end the process with exit code 0. The last thing a script does.
+
+    Nothing after the call happens then; a process without a group goes on.
 
     A thread of the group that lets go of a Python object while the interpreter is taken apart aborts the process
     ("terminate called without an active exception"), and the launcher calls that a failure. So what is registered to

@@ -12,7 +12,8 @@ An environment is a `gymnasium.Env` that speaks text:
   (above 0: the return of a good episode, by which searches scale rewards).
 
 Optional is `episodes(options) -> int | None`, a static method of the class: how many episodes an environment made with
-these options has, where a seed selects one of them modulo their number; `None` where every seed is another.
+these options has, where a seed selects one of them modulo their number; `None` where a seed makes its own
+(two seeds may still make the same: small MiniGrid levels do).
 
 Two things are optional, as methods of the innermost environment (`env.unwrapped`):
 

@@ -4,9 +4,9 @@ Episodes run as asyncio tasks: each thinks, acts and asks the model in its own t
 who shares a forward of the model with whom.
 
 - `continuous`: whoever asks joins at the next step of the work, and an answer is delivered as soon as it is finished,
-  so that its episode acts and asks again while the others write. Nobody waits for anybody; who is in the batch depends
-  on timing. Where arithmetic is batch-invariant (`agentspec.llm.local.invariance`) nothing else does, and a run repeats
-  to the last bit; elsewhere a rerun differs in the last bits and, now and then, in a token.
+  so that its episode acts and asks again while the others write. Nobody waits for the slowest; who is in the batch
+  depends on timing. Where arithmetic is batch-invariant (`agentspec.llm.local.invariance`) nothing else does, and a run
+  repeats to the last bit; elsewhere a rerun differs in the last bits and, now and then, in a token.
 - `closed`: a batch starts when every live episode waits on it, and all wait for its slowest answer. Who is in it
   depends on the work alone, never on timing, so that a run repeats whatever the arithmetic.
 

@@ -32,7 +32,7 @@ from agentspec.reading import read
 from agentspec.services import Services
 from agentspec.state import dump_state, load_state
 from agentspec.tokens import excerpt, news
-from agentspec.types import Action, ActionError, AgentInput, Decision, Recall, Task, Transition
+from agentspec.types import Action, ActionError, AgentInput, Decision, Experience, Recall, Task, Transition
 from agentspec.visible import visible
 
 FORMAT = (
@@ -147,8 +147,8 @@ class ReAct:
         thought = reading.thought if isinstance(reading.action, Action) else visible(rationale)[0]
         thought = " ".join(thought.split()).removeprefix("Thought:").strip()
         self._see(transition.input.text)
-        result = transition.info.get("error") or transition.info.get("message") or "done"
-        self._before = [transition.input.text, str(result)]
+        result = Experience.of(transition).feedback
+        self._before = [transition.input.text, result]
         self._transcript.append(f"Thought: {thought}\nAction: {transition.action_text}\nObservation: {result}")
 
     def _see(self, observation: str) -> None:

@@ -36,7 +36,7 @@ from trainers import grpo as grpo_module
 from trainers.audit import audit
 from trainers.config import ScaffoldConfig
 from trainers.counterfactuals import FOLDER as COUNTERFACTUALS
-from trainers.distributed import leave_group
+from trainers.distributed import end_process
 from trainers.grpo import ScaffoldGRPOTrainer
 from trainers.resume import load_state
 from trainers.rollouts import collect, task_rows
@@ -253,4 +253,4 @@ def test_ranks_had_different_numbers_of_rows(runs: tuple[Path, Path]) -> None:
 
 if __name__ == "__main__":
     run_cases(Path(sys.argv[1]), int(sys.argv[2]))
-    leave_group()
+    end_process()

@@ -37,7 +37,7 @@ from tests.trainers.test_data_parallel import built_episode, make_trainer
 from tests.trainers.test_supo import configured
 from trainers import grpo as grpo_module
 from trainers import policy_loss
-from trainers.distributed import check_layout, check_trained, keep_precision, leave_group
+from trainers.distributed import check_layout, check_trained, end_process, keep_precision
 from trainers.tree import model as tree_model
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -326,4 +326,4 @@ if __name__ == "__main__":
         step_in_bfloat16()
     else:
         run_cases(Path(sys.argv[2]), sys.argv[3])
-    leave_group()
+    end_process()

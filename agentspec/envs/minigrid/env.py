@@ -123,7 +123,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         """How many there are under these options: ten in the suite `paper`, one for a `task`, else one a seed."""
         if options.get("task"):
             return 1
-        return None if options.get("level") or options.get("suite", "paper") != "paper" else len(PAPER)
+        return None if options.get("level") or (options.get("suite") or "paper") != "paper" else len(PAPER)
 
     def __init__(
         self,
