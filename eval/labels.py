@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agentspec.failures import LEAVES, is_failure, leading, signs
-from agentspec.files import read_lines
 from agentspec.trajectory import Trajectory
 
 Labels = Mapping[str, frozenset[str]]
@@ -136,12 +135,16 @@ def read_labels(path: str | Path, episodes: Collection[str] = ()) -> Labels:
             without a line.
     """
     found: dict[str, frozenset[str]] = {}
-    for number, record in enumerate(read_lines(path), 1):
+    lines = Path(path).read_text(encoding="utf-8").splitlines()  # by hand: the last one may lack its end
+    for number, record in enumerate(map(json.loads, filter(str.strip, lines)), 1):
         episode, labels = record.get("episode"), record.get("labels")
-        if not isinstance(episode, str) or not isinstance(labels, list) or (episodes and episode not in episodes):
+        named = isinstance(episode, str) and (not episodes or episode in episodes)
+        if not named or not isinstance(labels, list) or not all(isinstance(label, str) for label in labels):
             raise ValueError(f'{path}, line {number}: expected {{"episode": ID, "labels": [...]}}, got {record}')
         if wrong := [label for label in labels if label not in LEAVES]:
             raise ValueError(f"{path}, line {number}: {wrong[0]!r} is none of {', '.join(LEAVES)}")
+        if episode in found:
+            raise ValueError(f"{path}, line {number}: episode {episode} has been labelled above; give it once")
         found[episode] = frozenset(labels)
     if missing := [e for e in episodes if e not in found]:
         raise ValueError(f"{path}: no labels for the episodes {', '.join(missing)}")

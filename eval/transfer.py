@@ -100,7 +100,12 @@ def diagonal(cells: Cells, home: Mapping[str, str], *, level: float = LEVEL, see
         estimate = Estimate(over.mean, over.low, over.high, over.n, "seed", p, "this checkpoint only")
     else:
         estimate = _stratified([(weight[arm], values) for arm, values in means.items()], level)
-    return Diagonal(estimate, *_permutation(cells, home, seed))
+    tasks = next(iter(next(iter(found.values())).values()))  # those that every cell has
+    common = {
+        arm: {run: {s: {t: of[s][t] for t in tasks} for s in sharing} for run, of in cells[arm].items()}
+        for arm in found
+    }
+    return Diagonal(estimate, *_permutation(common, home, seed))
 
 
 def _stratified(samples: Sequence[tuple[float, Sequence[float]]], level: float) -> Estimate:

@@ -71,10 +71,17 @@ def test_labels_are_read_and_checked(tmp_path: Path) -> None:
         ({"episode": "001", "labels": ["lazy"]}, "line 1: 'lazy' is none of"),
         ({"episode": "009", "labels": []}, "line 1: expected"),
         ({"episode": "001"}, "line 1: expected"),
+        ({"episode": "001", "labels": [{}]}, "line 1: expected"),
     ):
         path.write_text(json.dumps(wrong) + "\n")
         with pytest.raises(ValueError, match=message):
             read_labels(path, ["001"])
+    line = json.dumps({"episode": "001", "labels": [A]})
+    path.write_text(line)  # no end of line
+    assert read_labels(path) == {"001": {A}}
+    path.write_text(f"{line}\n{line}\n")
+    with pytest.raises(ValueError, match="line 2: episode 001 has been labelled above"):
+        read_labels(path)
 
 
 def test_a_transcript_shows_what_was_done_and_nothing_that_a_rule_found() -> None:

@@ -93,3 +93,14 @@ def test_tasks_that_a_cell_lacks_are_left_out_and_holes_refused() -> None:
     del played["b"]["1"]["y"]
     with pytest.raises(ValueError, match="run 1 of b has no value in y"):
         diagonal(played, HOME)
+
+
+def test_the_permutation_looks_at_the_tasks_of_the_estimate() -> None:
+    """A task that one cell alone has changes neither."""
+    homes = ["x", "y", "z"]
+    cells = {h: {"0": {s: {"t": float(s == h)} for s in homes}} for h in homes}
+    home = dict(zip(homes, homes, strict=True))
+    before = diagonal(cells, home)
+    cells["x"]["0"]["x"]["hard"] = -9.0
+    after = diagonal(cells, home)
+    assert (after.estimate.mean, after.permutation) == (before.estimate.mean, before.permutation) == (1.0, 1 / 6)
