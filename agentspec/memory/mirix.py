@@ -25,11 +25,11 @@ from agentspec.memory.parts.steps import (
     goal_of,
     newest_steps,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
@@ -242,7 +242,7 @@ class Mirix:
             related = [key for store in SEARCHED for key, _ in self._search(store, query, 1)]
             prompt = head + self._related(related) + EDIT_ALL.format(words=self.answer_tokens // 2)
             answer = await self.services.ask(
-                "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]})
+                "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]}, whole=False)
             )
             done: set[str] = set()
             for edit in answer.value["edits"] if answer.value else ():
@@ -250,7 +250,9 @@ class Mirix:
                     done.add(edit.store)
                     self._apply(edit.store, Edit(edit.op, edit.id, edit.fields))
         else:
-            answer = await self.services.ask("route", head + ROUTE.format(), 64, json_of({"stores": list[str]}))
+            answer = await self.services.ask(
+                "route", head + ROUTE.format(), 64, json_of({"stores": list[str]}, whole=False)
+            )
             names = dict.fromkeys(n for n in answer.value["stores"] if n in STORES) if answer.value else {}
             answers = await asyncio.gather(*(self._manage(name, head, query) for name in names))
             for name, edit in zip(names, answers, strict=True):

@@ -147,7 +147,7 @@ class AMem:
         """The steps that are left are a note; it is described when the next episode of the run begins."""
         if not trajectory.transitions:
             return
-        ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
+        ended = telling.outcome(trajectory)
         if self._open:
             self._open.append(["", ended])
             self._plain = [self._keep().id]
@@ -182,7 +182,7 @@ class AMem:
         words_left = self.answer_tokens // 2
         shown = prompt(prompts.ANALYSE, prompts.NOTE.format(note=content), prompts.FILED.format(words=words_left))
         analysed = await self.services.ask(
-            "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs)
+            "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs, whole=False)
         )
         if analysed.value is not None:
             keywords, tags = words(analysed.value.keywords), words(analysed.value.tags)
@@ -197,7 +197,9 @@ class AMem:
             prompts.NEW.format(note=note.described(content)),
             prompts.DECIDED.format(words=words_left),
         )
-        answer = await self.services.ask("evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs))
+        answer = await self.services.ask(
+            "evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs, whole=False)
+        )
         if answer.value is not None and answer.value.evolve:
             self._evolve(note, near, answer.value)
 

@@ -214,7 +214,7 @@ class GenerativeMemory:
             system(prompts.ASK.format(count=self.questions, task=task)),
             user(prompts.NEWEST.format(memories=memories)),
         )
-        parse = json_of({"questions": list[str]}, repairs=self.repairs)
+        parse = json_of({"questions": list[str]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("question", prompt, self.answer_tokens, parse)
         asked = answer.value["questions"] if answer.value is not None else []
         for question in [q for text in asked if (q := " ".join(text.split()))][: self.questions]:
@@ -228,7 +228,7 @@ class GenerativeMemory:
             system(prompts.CONCLUDE.format(count=self.insights, task=task)),
             user(prompts.STATEMENTS.format(statements=telling.numbered(texts), question=question)),
         )
-        parse = json_of({"insights": list[Insight]}, repairs=self.repairs)
+        parse = json_of({"insights": list[Insight]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("conclude", prompt, self.answer_tokens, parse)
         for insight in (answer.value["insights"] if answer.value is not None else [])[: self.insights]:
             rests_on = [found[n - 1].id for n in dict.fromkeys(insight.evidence) if 1 <= n <= len(texts)]

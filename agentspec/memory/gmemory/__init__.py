@@ -52,7 +52,8 @@ from agentspec.memory.gmemory.prompts import (
     verdict,
 )
 from agentspec.memory.parts import telling
-from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
+from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line
+from agentspec.memory.parts.waiting import shown_lines, task_of
 from agentspec.parameters import at_least, settings
 from agentspec.reflection.trials import episode_return
 from agentspec.retrieval import Graph
@@ -325,7 +326,7 @@ class GMemory:
         parts += [f"{told(e)}\nIt began: {e.text.partition(chr(10))[2]}" for e in [*good, *bad]]
         prompt = (system(COMPARE), user("\n\n".join(parts)))
         answer = await self.services.ask(
-            "compare", prompt, self.answer_tokens, self._json({"operations": list[Change]})
+            "compare", prompt, self.answer_tokens, self._json({"operations": list[Change]}, whole=False)
         )
         if answer.value is None:
             return
@@ -365,8 +366,8 @@ class GMemory:
     def _start_of(self, text: str) -> str:
         return clip_text(one_line(text), max(64, self.task_tokens // 2), self.services.llm.count_tokens)
 
-    def _json(self, schema: Any) -> Any:
-        return json_of(schema, repairs=self.repairs)
+    def _json(self, schema: Any, *, whole: bool = True) -> Any:
+        return json_of(schema, repairs=self.repairs, whole=whole)
 
     @property
     def _name(self) -> str:

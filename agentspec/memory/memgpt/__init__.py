@@ -26,7 +26,8 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, step_name, step_text, written
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -193,7 +194,7 @@ class MemGPT:
         searched = False
         for _ in range(2):
             answer = await self.services.ask(
-                "edit", self._prompt(since, warning, results), self.answer_tokens, json_of(FunctionCalls)
+                "edit", self._prompt(since, warning, results), self.answer_tokens, json_of(FunctionCalls, whole=False)
             )
             if answer.value is None:
                 return
