@@ -276,7 +276,8 @@ class LightMemory:
         done = starts[-1] if starts else len(self.sensory)
         ready, self.sensory = self.sensory[:done], self.sensory[done:]
         full = sum(self._tokens(steps) for _, steps in self.topics)
-        if self.topics and full + self._tokens(ready) > self.stm_tokens:
+        waiting = any(unwritten(steps) for _, steps in self.topics)
+        if waiting and full + self._tokens(ready) > self.stm_tokens:
             await self._extract()
         cuts = [0, *starts] if starts else [0, done]
         for begin, end in itertools.pairwise(cuts):
