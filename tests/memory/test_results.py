@@ -25,7 +25,7 @@ AT_ONCE: dict[str, dict[str, Any]] = {
     "mem0": {"every": 1, "summary_every": 0},
     "zep": {"every": 1},
     "simplemem": {"window": 1, "gate": 0.0, "overlap": 1},
-    "lightmem": {"sensory_tokens": 1, "stm_tokens": 1},
+    "lightmem": {"sensory_tokens": 1, "stm_tokens": 120},
 }
 
 
@@ -118,7 +118,8 @@ def test_an_outcome_is_told_in_the_environments_terms() -> None:
 
     earned = {"hourly_profit": 21.414, "net_earnings": 2.5, "deliveries": 1, "ended": "environment"}
     assert told("deliverybench", **earned) == (
-        "The episode ended after 2 steps. Return: +2.50, hourly profit ($/h): 21.41, net earnings ($): 2.5, deliveries: 1."
+        "The episode ended after 2 steps. Return: +2.50, hourly profit ($/h): 21.41, net earnings ($): 2.5, "
+        "deliveries: 1."
     )
     assert told("deliverybench", ended="max_steps") == "The episode was cut off after 2 steps. Return: +2.50."
     assert told("minigrid", success=0, efficiency=0.0, ended="budget").endswith(
