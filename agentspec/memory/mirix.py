@@ -15,6 +15,7 @@ observation itself. Preset `paper` has both of the paper's, `rl` both of the oth
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -53,6 +54,8 @@ STORES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 SEARCHED = tuple(name for name in STORES if name != "core")
 REWRITE_AT = 0.9
+JOINT = "; "
+"""Stands between the texts that were merged in a field."""
 RELATED = 3
 
 HEAD = (
@@ -311,8 +314,10 @@ class Mirix:
         else:
             old = dict(before.fields)
             for name, text in fields.items():
-                joined = text if edit.op == "update" or name not in old else f"{old[name]}; {text}"
-                old[name] = clip_text(joined, 2 * self.entry_tokens, count)
+                parts = [text] if edit.op == "update" or name not in old else [*old[name].split(JOINT), text]
+                while len(parts) > 1 and count(JOINT.join(parts)) > 2 * self.entry_tokens:
+                    parts.pop(0)  # what was merged last is kept
+                old[name] = clip_text(JOINT.join(parts), 2 * self.entry_tokens, count)
             self._put(edit.id, Entry(store, old, now.episode, now.step))
 
     def _put(self, key: int, entry: Entry) -> None:
@@ -331,9 +336,9 @@ class Mirix:
         answer = await self.services.ask("rewrite", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, self.services.llm.count_tokens)
         if text:
-            self.core, self._old_core = text[: self.core_chars], False
-        elif len(self.core) > self.core_chars:  # what was written last is kept
-            self.core = self.core[-self.core_chars :]
+            self.core, self._old_core = clip_text(text, self.core_chars, len), False
+        elif len(self.core) > self.core_chars:  # what was written last is kept, and no word or number in part
+            self.core = re.split(r"\s", self.core[-self.core_chars - 1 :], maxsplit=1)[-1][-self.core_chars :]
 
     async def _topic(self, input: AgentInput) -> str:
         """What to search for: the model's topic, or the observation where it names none."""

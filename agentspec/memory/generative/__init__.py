@@ -28,6 +28,7 @@ from agentspec.llm.base import system, user
 from agentspec.memory.generative import prompts
 from agentspec.memory.generative.stream import Memory, Stream, Weights
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import first_told
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.prompting import failure_reason
 from agentspec.protocols import Services
@@ -162,12 +163,12 @@ class GenerativeMemory:
             self._due = False
             await self._rate()
         now, context = self.services.time(), self.services.context
-        told = [input.text, *(message.text for message in context.messages)]
+        said = [input.text, *(message.text for message in context.messages)]
 
         def untold(memory: Memory) -> bool:
             """Not one of the steps that the conversation tells; a failure whose reason it does not give is recalled."""
-            held = memory.episode == now.episode and memory.step >= now.step - context.told
-            return not held or (memory.failed and not any(failure_reason(memory.line) in text for text in told))
+            held = memory.episode == now.episode and memory.step >= first_told(self.services)
+            return not held or (memory.failed and not any(failure_reason(memory.line) in text for text in said))
 
         where = untold if context.told else None
         found = self.stream.recall(input.text, k or self.top, now.total, where=where)

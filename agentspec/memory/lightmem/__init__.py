@@ -336,7 +336,8 @@ class LightMemory:
             if action == "delete":
                 self.entries.remove(entry.id)
             elif action == "update" and text:
-                self.entries.put(replace(entry, text=text, data=data))
+                newest = max((entry, *later), key=lambda e: e.time.total)  # what it says now is as of then
+                self.entries.put(replace(entry, text=text, time=newest.time, data=data))
             else:
                 self.entries.put(replace(entry, data=data))
 

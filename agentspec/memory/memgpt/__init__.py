@@ -26,7 +26,16 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    brief,
+    distinct,
+    first_told,
+    goal_of,
+    newest_within,
+    step_name,
+    step_text,
+    written,
+)
 from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
@@ -160,7 +169,9 @@ class MemGPT:
             for name, text in self.blocks.items()
             if text
         ]
-        items += [RecallItem(text, source="search", priority=1.0) for text in self._found]
+        first = first_told(self.services)
+        told = {self._named(m) for m in self._queue() if m.step >= first}
+        items += [RecallItem(text, source="search", priority=1.0) for text in self._found if text not in told]
         if self.services.context.layout == "snapshot":
             if self.summary:
                 items.append(RecallItem(CARRY.format(summary=self.summary), kind="summary", priority=3.0))

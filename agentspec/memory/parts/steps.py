@@ -89,6 +89,11 @@ def first_held(services: Services, step: int) -> int:
     return max(0, step + 1 - held)
 
 
+def first_told(services: Services) -> int:
+    """The first step of the episode that the conversation of this step's prompt tells; without one, this step."""
+    return services.time().step - services.context.told
+
+
 def written(answer: Answer[str], tokens: int, count_tokens: CountTokens) -> str:
     """What can be kept of an answer in words: of one that was cut off, its whole sentences; at most `tokens`."""
     text = str(answer.value or "").strip()

@@ -37,6 +37,7 @@ from typing import Any
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
 from agentspec.memory.parts.entries import NOTES, embedder_of, one_line, recalled
+from agentspec.memory.parts.steps import written
 from agentspec.memory.parts.waiting import Step, shown_lines, unwritten
 from agentspec.memory.zep.communities import Communities
 from agentspec.memory.zep.observed import put, read_state
@@ -81,7 +82,7 @@ PRESETS = {
     },
 }
 
-COMMUNITY_FACTS = 12
+COMMUNITY_FACTS, COMMUNITY_TOKENS = 12, 128
 
 
 class ZepMemory:
@@ -248,16 +249,19 @@ class ZepMemory:
     async def _communities(self) -> None:
         """Find communities, and sum up those that have changed, the largest first."""
         changed = self.communities.renew(self.graph.graph)[: self.most_summaries]
-        answers = await asyncio.gather(*(self._sum_up(ids) for _, ids in changed))
-        for (label, ids), answer in zip(changed, answers, strict=True):
-            if answer.value is not None and answer.problem == "":
-                self.communities.sum_up(label, ids, one_line(answer.value))
+        summaries = await asyncio.gather(*(self._sum_up(ids) for _, ids in changed))
+        for (label, ids), summary in zip(changed, summaries, strict=True):
+            if summary:
+                self.communities.sum_up(label, ids, summary)
 
-    async def _sum_up(self, ids: list[int]) -> Any:
+    async def _sum_up(self, ids: list[int]) -> str:
+        """The summary of a community; of one that was cut off its whole sentences."""
         facts = sorted(self.graph.of(ids), key=lambda e: -e.time.total)[:COMMUNITY_FACTS]
         shown = "\n".join([NOTES, *(self.timeline.shown(e) for e in reversed(facts))])
         prompt = (system(COMMUNITY), user(shown))
-        return await self.services.ask("community", prompt, min(128, self.answer_tokens))
+        room = min(COMMUNITY_TOKENS, self.answer_tokens)
+        answer = await self.services.ask("community", prompt, room)
+        return one_line(written(answer, room, self.services.llm.count_tokens))
 
     # -- state -----------------------------------------------------------------------------------------------------
 
