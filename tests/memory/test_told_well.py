@@ -52,8 +52,8 @@ def test_notes_of_steps_that_the_conversation_holds_are_not_recalled(turns: int,
 
 
 def test_a_note_with_one_step_that_is_not_held_is_recalled() -> None:
-    memory = in_conversation(lambda s: AMem(s, every=2), 4, **NOTED)
-    assert first_told(memory.services) == 1 and notes(memory) == {0, 1}
+    memory = in_conversation(lambda s: AMem(s, every=3), 3, **NOTED)
+    assert first_told(memory.services) == 2 and notes(memory) == {0, 1, 2}
 
 
 def test_what_a_search_found_is_not_told_beside_the_conversation() -> None:
