@@ -33,11 +33,11 @@ from agentspec.memory.parts.steps import (
     first_held,
     goal_of,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -219,7 +219,7 @@ class OpenClaw:
         )
         self._since = step
         prompt = head + LEARN.format(most=EDITS, words=self.answer_tokens // 2)
-        answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits))
+        answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits, whole=False))
         for edit in answer.value.edits[:EDITS] if answer.value else ():
             self._counts["edits"] += self.workspace.apply(edit)
 
