@@ -213,7 +213,9 @@ def beside_rules(sample: Sample, judged: Labels, judge: str) -> str:
     rows = {
         "rules": rules,
         judge: judged,
-        f"rules, and {judge} where they are silent": {e: rules[e] or (judged[e] & _all(e in unexplained)) for e in rules},
+        f"rules, and {judge} where they are silent": {
+            e: rules[e] or (judged[e] & _all(e in unexplained)) for e in rules
+        },
         f"`{often}` every time": dict.fromkeys(rules, frozenset({often})),
     }
     lines = ["| answers | said | right | precision | recall | kappa with a | with b |", "|---|---|---|---|---|---|---|"]
@@ -248,10 +250,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sample", nargs="?", default=SAMPLE, metavar="DIR", help="a labelled sample (default: ours)")
     parser.add_argument("--answers", help="labels to judge in the place of the rules, in the readers' format")
     judge = parser.add_argument_group("a model as judge")
-    judge.add_argument("--judge", metavar="MODEL", help="a model's name, folder or hub id: what it says of every episode")
+    judge.add_argument(
+        "--judge", metavar="MODEL", help="a model's name, folder or hub id: what it says of every episode"
+    )
     judge.add_argument("--llm", action="append", default=[], metavar="KEY=VALUE", help="setting of its backend")
     judge.add_argument("--max-prompt", type=int, default=16_000, help="most tokens of a prompt (default: %(default)s)")
-    judge.add_argument("--to", metavar="FILE", help="where its answers are kept; those that are there are not asked for")
+    judge.add_argument(
+        "--to", metavar="FILE", help="where its answers are kept; those that are there are not asked for"
+    )
     options = parser.parse_args(arguments)
     if bool(options.judge) != bool(options.to) or (options.judge and options.answers):
         parser.error("--judge MODEL and --to FILE belong together, and go without --answers")
