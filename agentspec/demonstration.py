@@ -22,9 +22,9 @@ from typing import Any
 from agentspec.declaration import Purpose
 from agentspec.envs.making import environment_class
 from agentspec.episode import Job, MakeEnv, Runner, make_env
+from agentspec.importing import import_name
 from agentspec.llm.base import LLMError, Request
 from agentspec.llm.demonstration import DemonstrationLLM
-from agentspec.importing import import_name
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.reworded import reworded
 from agentspec.spec import AgentSpec, ModuleSpec

@@ -6,9 +6,13 @@
 prints, per kind of failure, how the two readers agree (Cohen's kappa), and precision and recall of the rules of
 `agentspec.failures` against what both readers say. The unit is *episode x kind*: present or absent. Where one reader
 marked a kind and the other did not, the pair is disputed and counts for neither precision nor recall; it does count in
-the kappas of the rules against each reader. `--answers` judges a file of labels (of a model, of a reader) in the place
-of the rules; `--judge` asks a model (`eval.judge`), keeps what it answers in a file of labels, and sets it beside the
-rules, and beside the rules with the model where they are silent, which is how a judge is used. A sample ships (`eval/data/failures`, the default): the trajectories without model calls, who played them
+the kappas of the rules against each reader.
+
+`--answers` judges a file of labels (of a model, of a reader) in the place of the rules. `--judge` asks a model
+(`eval.judge`), keeps what it answers in such a file, and sets it beside the rules, and beside the rules with the model
+where they are silent, which is how a judge is used.
+
+A sample ships (`eval/data/failures`, the default): the trajectories without model calls, who played them
 (`sources.json`), both readers' labels, and what they were told (`LABELS.md`).
 """
 

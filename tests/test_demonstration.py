@@ -1,4 +1,4 @@
-"""An expert's answers to what memories ask: in the form they declare, in every memory, and unchanged where it counts."""
+"""An expert's answers to what memories ask: in the declared form, in every memory, unchanged where it counts."""
 
 from __future__ import annotations
 
@@ -125,7 +125,13 @@ def test_the_study_s_demonstrations_do_not_change(tokenizer: Any) -> None:
         "base": {"name": "base", "window": 6, "observation_tokens": 48},
         "summary": {"name": "summary", "every": 3, "summary_tokens": 900},
         "sheet": {"name": "dynamic_cheatsheet", "every": 3, "sheet_tokens": 900},
-        "bare sheet": {"name": "dynamic_cheatsheet", "preset": "rl", "every": 3, "sheet_tokens": 900, "step_tokens": 48},
+        "bare sheet": {
+            "name": "dynamic_cheatsheet",
+            "preset": "rl",
+            "every": 3,
+            "sheet_tokens": 900,
+            "step_tokens": 48,
+        },
     }
     found = {}
     for label, memory in scaffolds.items():
