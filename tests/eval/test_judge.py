@@ -16,7 +16,7 @@ from agentspec.types import Task
 from eval import labels
 from eval.failures import diagnose, replayed
 from eval.judge import NONE, Judge, judged, read_kind
-from eval.labels import UNSEEN, Agreement, Sample, agreed, agreement, beside_rules, kappa_of, read_labels
+from eval.labels import SAMPLE, UNSEEN, Agreement, Sample, agreed, agreement, beside_rules, kappa_of, read_labels
 from eval.transcripts import excerpt, transcript
 
 STRATEGY, STUCK = "understanding/knowledge/strategy", "grounding/spatial/stuck"
@@ -179,3 +179,12 @@ def test_one_command_asks_and_prints(
     assert "| all |" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         labels.main(arguments)
+
+
+def test_the_documentation_says_what_the_small_model_answered() -> None:
+    """It named the first kind of the list in every episode of both samples."""
+    text = (Path(__file__).parents[2] / "docs/evaluation.md").read_text()
+    for folder in (UNSEEN, SAMPLE):
+        both = Sample.read(folder)
+        said = dict.fromkeys(both.episodes, frozenset({next(iter(LEAVES))}))
+        assert beside_rules(both, said, "smollm2-135m") in text
