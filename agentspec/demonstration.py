@@ -118,5 +118,5 @@ class Words:
             if self.count_tokens(text) <= room:
                 return text
         text = reworded(example, notes[:1], asked)
-        cannot_be_cut = text.startswith("{")
+        cannot_be_cut = text.startswith(("{", "["))
         return reworded(example, [], asked) if cannot_be_cut else clip_text(text, room, self.count_tokens)

@@ -60,7 +60,7 @@ def import_name(target: str, what: str = "") -> Any:
     except SpecError as error:
         raise SpecError(f"{what} {target!r}: {error}".strip()) from error
     if not hasattr(found, name):
-        near = suggest(name, [n for n in vars(found) if not n.startswith("_")])
+        near = suggest(name, [n for n, v in vars(found).items() if getattr(v, "__module__", "") == found.__name__])
         raise SpecError(f"{what} {target!r}: there is no {name!r} in the module {module!r}{near}".strip())
     return getattr(found, name)
 
