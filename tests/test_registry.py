@@ -39,7 +39,7 @@ def test_a_name_is_found_without_importing_the_other_methods() -> None:
         ("reasoning", "common", "unknown reasoning 'common'"),
         ("memory", "../base", "unknown memory"),
         ("memory", "nowhere.module:Thing", "no module 'nowhere.module'"),
-        ("memory", "agentspec.memory.base:BaesMemory", "in the module 'agentspec.memory.base'; did you mean BaseMemory"),
+        ("memory", "agentspec.memory.base:BaesMemory", "agentspec.memory.base'; did you mean BaseMemory"),
         ("reasoning", "agentspec.memory.base:BaseMemory", "is a memory module; the spec names it as reasoning"),
         ("memory", "agentspec.types:Recall", "is no module; a module has the methods of one kind"),
         ("mood", "x", "unknown kind of module 'mood'"),
