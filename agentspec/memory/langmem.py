@@ -122,7 +122,7 @@ class LangMem:
             "semantic": Purpose("store", '{"edits": [{"op": "insert", "id": null, "text": "ADD gives 3."}]}'),
             "episodic": Purpose(
                 "store",
-                '{"observation": "Far below.", "thoughts": "Double.", "action": "DOUBLE()", "result": "It grew."}',
+                '{"observation": "So low.", "thoughts": "Double it.", "action": "DOUBLE() now", "result": "It grew."}',
             ),
             "procedural": Purpose("store", "Double while it is far below."),
         },

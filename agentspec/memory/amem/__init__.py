@@ -64,10 +64,10 @@ class AMem:
         calls=CallProfile(retrieve=(0, 4), store=(0, 4)),
         rl=CallProfile(retrieve=(0, 2), store=(0, 2)),
         purposes={
-            "analyse": Purpose("store", '{"keywords": ["DOUBLE"], "context": "It grew fast.", "tags": ["growth"]}'),
+            "analyse": Purpose("store", '{"keywords": ["step"], "context": "It grew fast.", "tags": ["progress"]}'),
             "evolve": Purpose(
                 "store",
-                '{"evolve": true, "links": ["n0"], "tags": ["growth"], '
+                '{"evolve": true, "links": ["n0"], "tags": ["progress"], '
                 '"neighbours": [{"id": "n0", "context": "The first step.", "tags": ["start"]}]}',
             ),
         },

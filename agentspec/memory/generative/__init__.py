@@ -90,7 +90,9 @@ class GenerativeMemory:
         rl=CallProfile(retrieve=(0, 1), store=(0, 3)),
         purposes={
             "rate": Purpose("store", '{"ratings": [6]}'),
-            "question": Purpose("store", '{"questions": ["Which operation grows fastest?", "What ends it?", "Why?"]}'),
+            "question": Purpose(
+                "store", '{"questions": ["Which operation grows fastest?", "What ends it?", "Why so?"]}'
+            ),
             "conclude": Purpose(
                 "store", '{"insights": [{"text": "DOUBLE() grows fastest.", "evidence": [1], "importance": 7}]}'
             ),

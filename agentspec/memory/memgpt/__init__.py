@@ -93,8 +93,8 @@ class MemGPT:
             "edit": Purpose(
                 "store",
                 '{"calls": [{"function": "core_append", "block": "task", "text": "Get 1000."}, '
-                '{"function": "archive_insert", "text": "ADD gives 3"}, {"function": "archive_search", "query": "3"}, '
-                '{"function": "recall_search", "query": "number"}], "heartbeat": true}',
+                '{"function": "archive_insert", "text": "ADD adds"}, {"function": "archive_search", "query": "task"}, '
+                '{"function": "recall_search", "query": "goal"}], "heartbeat": true}',
             ),
             "summary": Purpose("store", "The number grew from 3. The target is far."),
         },

@@ -86,7 +86,7 @@ class MemoryBank:
         purposes={
             "summary": Purpose("store", "Took order 3 at 12:04; it is in the bag, 250m from the customer."),
             "insight": Purpose(
-                "store", '{"insights": ["A minute costs 1 % of energy."], "avoid": ["SUB at 0"], "next": ["ADD"]}'
+                "store", '{"insights": ["A minute costs 1 % of energy."], "avoid": [], "next": ["ADD() first"]}'
             ),
             "overview": Purpose("store", "Energy falls by 1 % a minute. Two days went well."),
         },

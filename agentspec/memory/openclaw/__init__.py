@@ -96,11 +96,11 @@ class OpenClaw:
         purposes={
             "learn": Purpose(
                 "store",
-                '{"edits": [{"op": "add", "name": "early", "text": "DOUBLE while below half."}, '
-                '{"op": "skill", "name": "climb", "text": "1. ADD()\\n2. DOUBLE()", "description": "when far below"}]}',
+                '{"edits": [{"op": "add", "name": "seen", "text": "DOUBLE while below half."}, '
+                '{"op": "skill", "name": "way", "text": "1. ADD()\\n2. DOUBLE()", "description": "when far below"}]}',
             ),
             "flush": Purpose("store", "- The target is 1000.\n- ADD gives 3."),
-            "dream": Purpose("episode", '{"rules": [{"name": "double early", "text": "DOUBLE below 500 of 1000."}]}'),
+            "dream": Purpose("episode", '{"rules": [{"name": "seen", "text": "DOUBLE below 500 of 1000."}]}'),
         },
         needs=("embedder",),
         small=(

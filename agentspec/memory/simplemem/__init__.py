@@ -110,11 +110,11 @@ class SimpleMemory:
         purposes={
             "compress": Purpose(
                 "store",
-                '{"notes": [{"text": "SUB() takes 1 from the number.", "keywords": ["SUB"], "place": "", '
-                '"entities": ["number"], "topic": "operations"}, {"text": "SUB() takes 1 from the number always.", '
+                '{"notes": [{"text": "SUB() takes 1 from the number.", "keywords": ["rule"], "place": "", '
+                '"entities": ["world"], "topic": "rules"}, {"text": "SUB() takes 1 from the number always.", '
                 '"keywords": [], "place": "", "entities": [], "topic": ""}]}',
             ),
-            "merge": Purpose("store", '{"text": "SUB() takes 1 from every number.", "keywords": ["SUB"]}'),
+            "merge": Purpose("store", '{"text": "SUB() takes 1 from every number.", "keywords": ["rule"]}'),
             "plan": Purpose("retrieve", '{"queries": ["what SUB() does"]}'),
             "check": Purpose("retrieve", '{"enough": false, "queries": ["what the target is"]}'),
         },

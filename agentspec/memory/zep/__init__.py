@@ -115,11 +115,11 @@ class ZepMemory:
         purposes={
             "extract": Purpose(
                 "store",
-                '{"facts": [{"subject": "the agent itself", "relation": "wants", "object": "the target", '
-                '"fact": "The agent wants the target.", "since": 1}, {"subject": "SUB() action", "relation": "lowers", '
-                '"object": "the number", "fact": "SUB() takes 1 from the number.", "since": null}]}',
+                '{"facts": [{"subject": "agent-itself", "relation": "wants", "object": "target", '
+                '"fact": "The agent wants the target.", "since": 1}, {"subject": "agent-itself", "relation": "knows", '
+                '"object": "place", "fact": "SUB() takes 1 from the number.", "since": null}]}',
             ),
-            "same": Purpose("store", '{"same": [{"name": "the agent itself", "known": 0}]}'),
+            "same": Purpose("store", '{"same": [{"name": "agent-itself", "known": 0}]}'),
             "resolve": Purpose("store", '{"results": [{"fact": 0, "same": null, "contradicts": [0]}]}'),
             "community": Purpose("episode", "SUB() takes 1 from the number, which is below 1000."),
         },
