@@ -11,7 +11,8 @@ is left. Then it audits all runs and writes `OUT/report` (also `agentspec report
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,12 +45,13 @@ def main() -> None:
     study = read_study({**data, "out": options.out} if options.out else data)
     configs = {name: arm_config(study, name) for name in study.arms}
     warm = written(study, "warmup", study.warmup, False) if study.warmup else None
+    tasks = held_out(study, configs, warm)
     if options.dry_run:
-        print(planned(study, configs, warm))
+        print(planned(study, configs, warm, tasks))
         return
     if not options.no_train:
         train_all(study, max(1, options.jobs))
-    evaluate_all(study, configs)
+    evaluate_all(study, configs, tasks)
 
 
 def written(study: Study, name: str, data: Mapping[str, Any], begun: bool) -> Any:
@@ -90,15 +92,34 @@ def arm_config(study: Study, name: str) -> Any:
     return config
 
 
-def held_out(study: Study, config: Any) -> dict[str, Any]:
-    """The tasks that all policies play."""
-    from agentspec.tasks import make_tasks
+def held_out(study: Study, configs: Mapping[str, Any], warm: Any) -> dict[str, Any]:
+    """The tasks that all policies play: different episodes, on which neither an arm nor its start is trained.
 
-    name, options = config.world
-    return {name: make_tasks(name, options, study.tasks, split="test")}
+    Raises:
+        SpecError: the world has too few.
+    """
+    from agentspec.tasks import make_tasks, unseen_tasks
+
+    every = [*configs.values(), *([warm] if warm else [])]
+    worlds = [(*config.world, config.train_tasks) for config in every]
+    worlds += [world for config in every for world in begun_with(config.adapter)]
+    trained = [task for name, options, count in worlds for task in make_tasks(name, options, count)]
+    name, options = every[0].world
+    return {name: unseen_tasks(name, options, study.tasks, trained)}
 
 
-def evaluate_all(study: Study, configs: Mapping[str, Any]) -> None:
+def begun_with(adapter: str) -> Iterator[tuple[str, dict[str, Any], int]]:
+    """World and number of tasks that a run whose folder `adapter` is was trained on, and the runs before it."""
+    from agentspec.records.folder import MANIFEST
+    from trainers.ahead import check_world
+
+    while adapter and (file := Path(adapter) / MANIFEST).is_file():
+        config = json.loads(file.read_text())["config"]
+        yield *check_world(config["environment"] or "deliverybench"), config["train_tasks"]
+        adapter = config["adapter"]
+
+
+def evaluate_all(study: Study, configs: Mapping[str, Any], tasks: Mapping[str, Any]) -> None:
     """Play the matrix, audit every run, write `study.json` and the report."""
     from agentspec.files import append_lines, write_atomic
     from agentspec.llm.models import resolve_adapter
@@ -110,7 +131,6 @@ def evaluate_all(study: Study, configs: Mapping[str, Any]) -> None:
     out, before, config = Path(study.out), cpu_seconds(), next(iter(configs.values()))
     start = str(resolve_adapter(config.adapter)) if config.adapter else ""
     policies = study.policies(config.model, start, lora=bool(config.lora_r or start))
-    tasks = held_out(study, config)
     evaluate(policies, study.scaffolds, tasks, out=out, settings=study.settings, twins=True, observer=LiveTable())
     append_lines(out / "costs.jsonl", {"what": "evaluation", "cpu_s": round(cpu_seconds() - before, 1)})
     rollouts = {name: c.generation_batch_size for name, c in configs.items()}
@@ -129,7 +149,7 @@ def receipt(folder: Path) -> dict[str, Any]:
     return {"updates": sum(f.round is not None for f in found), "head": file_digest(folder / "seal.json"), **told}
 
 
-def planned(study: Study, configs: Mapping[str, Any], warm: Any) -> str:
+def planned(study: Study, configs: Mapping[str, Any], warm: Any, tasks: Mapping[str, Any]) -> str:
     """Runs, episodes, hours and the smallest difference that would be found."""
     from eval.study.cost import Rounds, estimate
 
@@ -140,7 +160,6 @@ def planned(study: Study, configs: Mapping[str, Any], warm: Any) -> str:
     }
     warmup = (warm.train_tasks, warm.num_train_epochs) if warm else (0, 0.0)
     lora = bool(config.lora_r or config.adapter)
-    tasks = held_out(study, config)
     return estimate(study, config.model, tasks, rounds, start=config.adapter, lora=lora, warmup=warmup)
 
 

@@ -185,6 +185,32 @@ def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
         assert not any("mad" in label or "openclaw" in label for label in labels)
 
 
+def test_held_out_are_episodes_that_nobody_is_trained_on(tmp_path: Path) -> None:
+    """The study of MiniGrid, whose seeds repeat 196 layouts; and a start that another study has left."""
+    from agentspec.tasks import SPLITS, episode_key, make_tasks
+    from eval.study import read_study
+
+    given = read_study({**read_extended("transfer_minigrid_cpu", CONFIGS), "out": str(tmp_path)})
+    configs = {arm: learning_study.arm_config(given, arm) for arm in given.arms}
+    warm = learning_study.written(given, "warmup", given.warmup, False)
+    [held_out] = learning_study.held_out(given, configs, warm).values()
+    trained = {episode_key(task) for c in (warm, *configs.values()) for task in make_tasks(*c.world, c.train_tasks)}
+    played = {episode_key(task) for task in held_out}
+    assert len(played) == len(held_out) == given.tasks == 32 and not played & trained
+    assert all(task.split == "test" and task.seed >= SPLITS["test"] for task in held_out)
+    by_seed = make_tasks(*warm.world, 32, split="test")  # seeds alone do not keep them apart
+    assert any(episode_key(task) in trained for task in by_seed)
+    # The same start as a folder, from which its manifest tells what it was trained on.
+    told = {"environment": {"name": warm.world[0], "options": warm.world[1]}, "train_tasks": 192, "adapter": ""}
+    (tmp_path / "manifest.json").write_text(json.dumps({"config": told}))
+    for config in configs.values():
+        config.adapter = str(tmp_path)
+    assert learning_study.held_out(given, configs, None) == {"minigrid": held_out}
+    warm.train_tasks = 5000
+    with pytest.raises(SpecError, match=r"got 32 tasks, expected at most 0: minigrid with .*MemoryS13Random"):
+        learning_study.held_out(given, configs, warm)
+
+
 def test_the_paper_s_six_are_evaluated() -> None:
     from eval.study import read_study
 
