@@ -174,8 +174,8 @@ def _gains(home: Mapping[str, str], values: Values, metric: Metric) -> list[Bloc
     ]
     caption = (
         f"Gain over the start in {metric.heading}, on the same tasks. All runs begin with the start, so it is a "
-        f"constant and each run has one gain: t over training runs (fewer than {LEAST_RUNS}: sign-flip test over tasks, "
-        f"this checkpoint only); p corrected by Holm over this table; {VERDICTS}."
+        f"constant and each run has one gain: t over training runs (fewer than {LEAST_RUNS}: sign-flip test over "
+        f"tasks, this checkpoint only); p corrected by Holm over this table; {VERDICTS}."
     )
     return [
         Heading("What training gained", 3),

@@ -31,7 +31,7 @@ STUDY: dict[str, Any] = {
 
 def test_a_study_is_read() -> None:
     study = read_study({**STUDY, "evaluation": {"concurrency": 2, "backend": {"dtype": "bfloat16"}}})
-    assert study.arms["b"].recipe == "grpo_memory" and study.arms["b"].fields == {"max_steps": 3}
+    assert (study.arms["b"].trainer, study.arms["b"].fields) == ("memory", {"max_steps": 3})
     # Seed by seed: who stops early has whole replicates.
     assert study.runs[:3] == [("a", 0), ("b", 0), ("a", 1)]
     assert study.settings.concurrency == 2 and study.ended == []
@@ -132,7 +132,9 @@ def reported(folder: Path, runs: int) -> list[Any]:
     for arm, home in (("a", "x"), ("b", "y")):
         places = {str(run): f"runs/{arm}{run}" for run in range(runs)}
         for place in places.values():
-            append_lines(folder / place / "metrics.jsonl", {"step": 1, "reward": 0.0, **logged})
+            # Two steps of one generation round (`num_iterations: 2`): a line of the log each, one receipt.
+            append_lines(folder / place / "metrics.jsonl", *({"step": s, "reward": 0.0, **logged} for s in (1, 2)))
+            append_lines(folder / place / "updates.jsonl", {"round": 1})
         arms[arm] = {"scaffold": home, "trainer": "grpo", "rollouts": 6, "runs": places}
     audits = {"a0": {"updates": 1, "violations": ["row 3 was edited"], "notes": [], "head": "abc"}}
     told = {"arms": arms, "audits": audits, "table": {"Non-RL": "start", "GRPO": "a"}, "compare": {"which": ["a", "b"]}}
