@@ -1,13 +1,13 @@
 """What to play: tasks by split, and labelled sets of them.
 
 Shared by training, evaluation and the command line. Splits are ranges of seeds: where every seed starts another
-episode, a policy is never tested on what it was trained on. A finite suite repeats its episodes, whatever the split:
-`episode_key` tells them apart.
+episode, a policy is never tested on what it was trained on. A finite suite or a small level repeats its episodes,
+whatever the split: `episode_key` tells them apart, `unseen_tasks` leaves out what was trained on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -39,13 +39,52 @@ def make_tasks(env: str, options: dict[str, Any], count: int, *, split: str = "t
     return [Task(env, base + i, options, split) for i in range(count)]
 
 
-def episode_key(task: Task) -> str:
-    """The same for tasks that are the same episode: seeds of a finite suite count modulo its number of episodes.
+def episode_key(task: Task) -> Hashable:
+    """The same for tasks that start the same episode.
 
-    See `episodes` in `agentspec.envs.contract`.
+    The environment names its episodes (`episode_key` in `agentspec.envs.contract`); where it does not, every seed is
+    one of its own.
+
+    Raises:
+        SpecError: options that the environment does not take.
     """
-    count = getattr(environment_class(task.env), "episodes", lambda _: None)(task.options)
-    return replace(task, seed=task.seed % count if count else task.seed, split="").key
+    named = getattr(environment_class(task.env), "episode_key", None)
+    if named is None:
+        return replace(task, split="").key
+    try:
+        return environment_name(task.env), named(task.options, task.seed)
+    except ValueError as error:
+        raise SpecError(f"env {task.env!r}: {error}") from error
+
+
+PATIENCE = 1000
+"""Seeds in a row without an episode that was not met before, after which a world is taken to have no more."""
+
+
+def unseen_tasks(
+    env: str, options: dict[str, Any], count: int, trained: Iterable[Task], *, split: str = "test"
+) -> list[Task]:
+    """The first `count` tasks of a split that are different episodes, none of them one of `trained`.
+
+    Raises:
+        SpecError: there are not that many.
+    """
+    seen = {episode_key(task) for task in trained}
+    found: list[Task] = []
+    last = 0
+    for number, task in enumerate(make_tasks(env, options, SPLITS["validation"], split=split)):
+        if len(found) == count or number - last > PATIENCE:
+            break
+        if (key := episode_key(task)) not in seen:
+            seen.add(key)
+            found.append(task)
+            last = number
+    if len(found) < count:
+        raise SpecError(
+            f"got {count} tasks, expected at most {len(found)}: {environment_name(env)} with {options} has no more "
+            f"episodes in its {split} split that are not trained on; ask for fewer, or train on fewer (`train_tasks`)"
+        )
+    return found
 
 
 def task_sets(tasks: Tasks) -> dict[str, list[Task]]:

@@ -20,9 +20,12 @@ from eval.statistics import Estimate, compare_runs, corrected, least_p, paired_r
 
 Row = Mapping[str, Any]
 
+VERDICTS = "the corrected p decides the verdict, also where the interval (uncorrected) says otherwise"
+"""What every caption of a table with verdicts says."""
+
 DIFFERENCES = (
-    "t interval; p corrected by Holm over the table. n in seeds: sign-flip test over tasks, about these checkpoints "
-    "only; n in runs: t test over training runs"
+    f"t interval; p corrected by Holm over the table; {VERDICTS}. n in seeds: sign-flip test over tasks, about these "
+    "checkpoints only; n in runs: t test over training runs"
 )
 
 
@@ -103,7 +106,7 @@ def differences(
     """
     if by not in ("policy", "scaffold"):
         raise ValueError(f"by must be 'policy' or 'scaffold', got {by!r}")
-    fixed = "scaffold" if by == "policy" else "policy"
+    constant = "scaffold" if by == "policy" else "policy"
     found: dict[tuple[str, str], dict[str, dict[str, dict[str, float]]]] = {}
     for (tasks, policy, scaffold), members in _grouped(rows).items():
         varied, held = (policy, scaffold) if by == "policy" else (scaffold, policy)
@@ -116,10 +119,12 @@ def differences(
             if name != baseline:
                 other = values[baseline]
                 if by == "policy":
-                    compared = compare_runs([*mine.values()], [*other.values()], level=level, seed=seed)
+                    fixed = "" in mine or "" in other  # a policy that is no training run of a recipe
+                    sides = [*mine.values()], [*other.values()]
+                    compared = compare_runs(*sides, fixed=fixed, level=level, seed=seed)
                 else:
                     compared = paired_runs(mine, other, level=level, seed=seed)
-                named.append(({"tasks": tasks, fixed: held, by: name, "baseline": baseline}, compared))
+                named.append(({"tasks": tasks, constant: held, by: name, "baseline": baseline}, compared))
     estimates = corrected([compared for _, compared in named])
     return [{**names, **e.to_data(), "tie": e.tie(level)} for (names, _), e in zip(named, estimates, strict=True)]
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +23,16 @@ from recipes.common import CONFIGS, run_recipe
 if TYPE_CHECKING:
     from eval.study import Study
 
+RECIPES = {"grpo": "grpo_delivery", "supo": "supo_delivery", "memory": "grpo_memory"}
+"""`trainer` of an arm -> the recipe that trains it."""
+
 
 def main() -> None:
     """Train what is not trained, evaluate what is not evaluated, audit, report."""
     from agentspec.extends import read_extended
     from agentspec.registry import SpecError
     from eval.study import read_study
-    from eval.study.training import train_all
+    from eval.study.playing import held_out
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
     parser.add_argument("--config", metavar="FILE", help="the study, or the name of one that ships")
@@ -44,12 +48,13 @@ def main() -> None:
     study = read_study({**data, "out": options.out} if options.out else data)
     configs = {name: arm_config(study, name) for name in study.arms}
     warm = written(study, "warmup", study.warmup, False) if study.warmup else None
+    tasks = held_out(study.tasks, [*configs.values(), *([warm] if warm else [])])
     if options.dry_run:
-        print(planned(study, configs, warm))
+        print(planned(study, configs, warm, tasks))
         return
     if not options.no_train:
         train_all(study, max(1, options.jobs))
-    evaluate_all(study, configs)
+    evaluate_all(study, configs, tasks)
 
 
 def written(study: Study, name: str, data: Mapping[str, Any], begun: bool) -> Any:
@@ -90,57 +95,76 @@ def arm_config(study: Study, name: str) -> Any:
     return config
 
 
-def held_out(study: Study, config: Any) -> dict[str, Any]:
-    """The tasks that all policies play."""
-    from agentspec.tasks import make_tasks
+def train_all(study: Study, jobs: int) -> None:
+    """The warm start, then every training run that has not ended, `jobs` at a time.
 
-    name, options = config.world
-    return {name: make_tasks(name, options, study.tasks, split="test")}
+    Raises:
+        SystemExit: one failed; those that are under way go on to their ends.
+    """
+    from agentspec.records.folder import MANIFEST
+
+    if study.start and not (study.start / MANIFEST).is_file():  # it is written last
+        process(study, "warm start", "sft_warmup", "warmup", study.start)
+
+    def one(arm: str, seed: int) -> None:
+        recipe, more = RECIPES[study.arms[arm].trainer], ("--seed", str(seed), "--resume", "true")
+        process(study, f"train {arm}", recipe, arm, study.folder(arm, seed), *more)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        started = [pool.submit(one, *run) for run in study.runs if run not in study.ended]
+        try:
+            for run in started:
+                run.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-def evaluate_all(study: Study, configs: Mapping[str, Any]) -> None:
+def process(study: Study, what: str, recipe: str, config: str, folder: Path, *more: str) -> None:
+    """One recipe in a process of its own; what it took is a line of `costs.jsonl`.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    from agentspec.cli.train import in_a_process
+    from agentspec.files import append_lines
+    from eval.report.training import COSTS
+
+    file = Path(study.out) / "configs" / f"{config}.yaml"
+    seconds = in_a_process(recipe, "--config", str(file), "--output_dir", str(folder), *more)
+    append_lines(Path(study.out) / COSTS, {"what": what, "run": folder.name, "cpu_s": round(seconds, 1)})
+
+
+def evaluate_all(study: Study, configs: Mapping[str, Any], tasks: Mapping[str, Any]) -> None:
     """Play the matrix, audit every run, write `study.json` and the report."""
-    from agentspec.files import append_lines, write_atomic
     from agentspec.llm.models import resolve_adapter
-    from eval.live import LiveTable
-    from eval.matrix import evaluate
-    from eval.report import build_report, write_files
-    from eval.study.cost import cpu_seconds
+    from eval.study.playing import conclude, play
 
-    out, before, config = Path(study.out), cpu_seconds(), next(iter(configs.values()))
+    config = next(iter(configs.values()))
     start = str(resolve_adapter(config.adapter)) if config.adapter else ""
-    policies = study.policies(config.model, start, lora=bool(config.lora_r or start))
-    tasks = held_out(study, config)
-    evaluate(policies, study.scaffolds, tasks, out=out, settings=study.settings, twins=True, observer=LiveTable())
-    append_lines(out / "costs.jsonl", {"what": "evaluation", "cpu_s": round(cpu_seconds() - before, 1)})
-    rollouts = {name: c.generation_batch_size for name, c in configs.items()}
-    write_atomic(out / "study.json", study.record(rollouts, {run: receipt(study.folder(*run)) for run in study.ended}))
-    for path in write_files(build_report(out, title=out.name), out / "report"):
+    play(study, study.policies(config.model, start, lora=bool(config.lora_r or start)), tasks)
+    audits = {run: receipt(study.folder(*run)) for run in study.ended}
+    for path in conclude(study, {name: c.generation_batch_size for name, c in configs.items()}, audits):
         print(path)
 
 
 def receipt(folder: Path) -> dict[str, Any]:
     """What the audit of a run says."""
-    from agentspec.files import file_digest
+    from agentspec.records.folder import SEAL, digest_of
     from trainers.audit import audit
 
     found = list(audit(folder))
     told = {"violations": [v for f in found for v in f.violations], "notes": [n for f in found for n in f.notes]}
-    return {"updates": sum(f.round is not None for f in found), "head": file_digest(folder / "seal.json"), **told}
+    return {"updates": sum(f.round is not None for f in found), "head": digest_of(folder / SEAL), **told}
 
 
-def planned(study: Study, configs: Mapping[str, Any], warm: Any) -> str:
+def planned(study: Study, configs: Mapping[str, Any], warm: Any, tasks: Mapping[str, Any]) -> str:
     """Runs, episodes, hours and the smallest difference that would be found."""
     from eval.study.cost import Rounds, estimate
 
     config = next(iter(configs.values()))
-    rounds = {
-        name: Rounds(c.max_steps * c.gradient_accumulation_steps // c.steps_per_generation, c.generation_batch_size)
-        for name, c in configs.items()
-    }
+    rounds = {name: Rounds(c.rounds, c.generation_batch_size) for name, c in configs.items()}
     warmup = (warm.train_tasks, warm.num_train_epochs) if warm else (0, 0.0)
     lora = bool(config.lora_r or config.adapter)
-    tasks = held_out(study, config)
     return estimate(study, config.model, tasks, rounds, start=config.adapter, lora=lora, warmup=warmup)
 
 

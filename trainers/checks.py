@@ -272,10 +272,10 @@ def notes(config: ScaffoldConfig) -> Iterator[str]:
 
 
 def _seen(config: ScaffoldConfig) -> Iterator[str]:
-    """Held-out tasks that are training tasks all the same, in suites of few episodes."""
+    """Held-out tasks that are training tasks all the same, in worlds of few episodes."""
     trained = {episode_key(task) for task in make_tasks(*config.world, config.train_tasks)}
     validated = config.validation_tasks if config.validates else 0
     for split, count in (("validation", validated), ("test", config.eval_tasks)):
         tasks = make_tasks(*config.world, count, split=split)
         if seen := sum(episode_key(task) in trained for task in tasks):
-            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: there are no others"
+            yield f"{seen} of {count} tasks of the {split} split are episodes that are trained on: seeds repeat them"

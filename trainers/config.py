@@ -6,6 +6,7 @@ each field. What cannot work or would not be exact is refused at start (`trainer
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,7 @@ from agentspec.carry import start_bank
 from agentspec.llm.models import base_of
 from agentspec.mixture import mixture
 from agentspec.parameters import check_types
+from agentspec.records.chain import steps_per_round
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from rewards import RewardSet
@@ -188,6 +190,14 @@ class ScaffoldConfig(GRPOConfig):
     def world(self) -> tuple[str, dict[str, Any]]:
         """Name and options of the environment; `SpecError` where there is no such."""
         return check_world(self.environment or "deliverybench")
+
+    @property
+    def rounds(self) -> int:
+        """Generation rounds of the run: of its `max_steps` or, without them, of its passes over the tasks."""
+        if self.max_steps > 0:
+            return math.ceil(self.max_steps / steps_per_round(vars(self)))
+        groups = (self.generation_batch_size or 0) // self.num_generations
+        return math.ceil(self.num_train_epochs * (self.train_tasks // groups))
 
     @property
     def validates(self) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import os
+import subprocess
 import sys
 from typing import Any
 
@@ -38,6 +40,25 @@ def run(arguments: argparse.Namespace) -> int:
     sys.argv = [f"agentspec train {arguments.recipe}", *arguments.options]
     run_recipe(recipe.main)
     return 0
+
+
+def in_a_process(recipe: str, *options: str) -> float:
+    """Run a recipe in a process of its own, of one thread unless the environment says otherwise.
+
+    Returns:
+        CPU seconds that it took.
+
+    Raises:
+        SystemExit: it failed.
+    """
+    command = [sys.executable, "-m", "agentspec.cli", "train", recipe, *options]
+    print(" ".join(command), file=sys.stderr, flush=True)
+    started = subprocess.Popen(command, env={"OMP_NUM_THREADS": "1", **os.environ})
+    _, status, usage = os.wait4(started.pid, 0)
+    started.returncode = os.waitstatus_to_exitcode(status)
+    if started.returncode:
+        raise SystemExit(f"{' '.join(command)}: failed (see above); it goes on from its last checkpoint if resumed")
+    return usage.ru_utime + usage.ru_stime
 
 
 def recipes() -> dict[str, str]:

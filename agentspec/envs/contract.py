@@ -11,9 +11,10 @@ An environment is a `gymnasium.Env` that speaks text:
 - The class's `metadata` declares `metrics` (`agentspec.metrics.Metric`, the primary one first) and `typical_return`
   (above 0: the return of a good episode, by which searches scale rewards).
 
-Optional is `episodes(options) -> int | None`, a static method of the class: how many episodes an environment made with
-these options has, where a seed selects one of them modulo their number; `None` where a seed makes its own
-(two seeds may still make the same: small MiniGrid levels do).
+Optional is `episode_key(options, seed) -> Hashable`, a static method of the class: the name of the episode that a seed
+starts in an environment made with these options. Where seeds repeat episodes (a fixed suite, a small level), those that
+start the same have the same name; how an episode is shown, worded or cut short is no part of it. It is called for every
+task of a configuration, so it should take about a millisecond. Without it every seed is an episode of its own.
 
 Two things are optional, as methods of the innermost environment (`env.unwrapped`):
 

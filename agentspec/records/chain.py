@@ -154,7 +154,7 @@ def check_end(folder: Path, config: Mapping[str, Any], head: str = "") -> tuple[
         named |= set(files_of(record))
         carried.append(str(chain_of(record).get("memory", "")))
         last = record["round"] if isinstance(record.get("round"), int) else last
-        reached = max(reached, last + _steps_per_round(record))
+        reached = max(reached, last + steps_per_round(_mapping(record.get("settings"))))
     sealed = (folder / SEAL).is_file()
     problems = _check_seal(folder, head) if sealed else []
     steps = {METRICS: max((_step(line) for _, line in whole_lines(folder / METRICS)), default=0)}
@@ -179,9 +179,8 @@ def check_end(folder: Path, config: Mapping[str, Any], head: str = "") -> tuple[
     return problems, [f"no {SEAL}: interrupted or under way after update {last}; nothing after its receipt is covered"]
 
 
-def _steps_per_round(record: Mapping[str, Any]) -> int:
-    """Optimiser steps that are made of one generation round."""
-    given = _mapping(record.get("settings"))
+def steps_per_round(given: Mapping[str, Any]) -> int:
+    """Optimiser steps that are made of one generation round, by the settings of its trainer."""
     names = ("steps_per_generation", "num_iterations", "gradient_accumulation_steps")
     made, repeated, taken = (n if isinstance(n := given.get(name), int) and n > 0 else 1 for name in names)
     return max(1, made * repeated // taken)

@@ -6,10 +6,13 @@ trajectories and checkpoints belong to each other and to no other run.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import Any
 
 from agentspec.carry import FILE as MEMORY
 from agentspec.files import file_digest, held
@@ -53,6 +56,19 @@ def round_files(folder: Path) -> list[Path]:
 def digest_of(path: Path) -> str:
     """Digest of a file; empty if there is none."""
     return file_digest(path) if path.is_file() else ""
+
+
+def trained_on(folder: str | Path) -> Iterator[tuple[str, dict[str, Any], int]]:
+    """World, its options and number of training tasks of the run that left `folder`, and of those it began with.
+
+    Nothing where the folder is no run's: a shipped adapter, a hub id.
+    """
+    while folder and (file := Path(folder) / MANIFEST).is_file():
+        config = json.loads(file.read_text(encoding="utf-8"))["config"]
+        world = config.get("environment") or "deliverybench"
+        world = {"name": world} if isinstance(world, str) else world
+        yield world["name"], dict(world.get("options") or {}), int(config["train_tasks"])
+        folder = config.get("adapter") or ""
 
 
 def holds_run(folder: str | Path) -> bool:

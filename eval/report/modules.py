@@ -10,7 +10,7 @@ from eval.report import figures
 from eval.report.blocks import Block, Figure, Heading, Table, Text
 from eval.report.captions import LEVEL, acts, name_of, unit_of
 from eval.statistics import Estimate, interactions, runs_mean
-from eval.tables import show, show_p, values_by_run
+from eval.tables import VERDICTS, show, show_p, values_by_run
 
 Row = Mapping[str, Any]
 
@@ -93,7 +93,7 @@ def _interactions(rows: Sequence[Row], metric: Metric) -> list[Block]:
     caption = (
         f"Interactions in {metric.heading}: how far a combination is from the sum of its parts; OLS, errors clustered "
         f"by task (by training run where there are runs; {next(iter(found.values())).n} clusters), p corrected by Holm "
-        "over the table. Whatever else scaffolds differ in (layout, parameters) is averaged."
+        f"over the table; {VERDICTS}. Whatever else scaffolds differ in (layout, parameters) is averaged."
     )
     return [Table(["combination", "effect", "p", "verdict"], body, caption)]
 

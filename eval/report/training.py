@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from agentspec.files import read_lines
+from agentspec.records.folder import METRICS, UPDATES
 from eval.report.blocks import Block, Heading, Table, Text
 
 Row = Mapping[str, Any]
@@ -57,7 +58,10 @@ def _counts(key: str) -> bool:
 
 
 def _log(folder: Path) -> list[dict[str, Any]]:
-    path = folder / "metrics.jsonl"
+    return _lines(folder / METRICS)
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
     return read_lines(path) if path.is_file() else []
 
 
@@ -79,18 +83,16 @@ def _of_path(logs: Sequence[Sequence[Row]], path: str) -> list[str]:
 
 def taken(rows: Sequence[Row], study: Mapping[str, Any], folder: Path) -> list[Block]:
     """Tokens and CPU hours of all there was to do."""
-    spent = read_lines(folder / COSTS) if (folder / COSTS).is_file() else []
     hours: dict[str, float] = {}
-    for line in spent:
+    for line in _lines(folder / COSTS):
         hours[line["what"]] = hours.get(line["what"], 0.0) + line["cpu_s"] / 3600
     played: dict[str, tuple[int, float, float]] = {}
     for arm, item in study["arms"].items():
         for run in item["runs"].values():
-            for row in _log(folder / run):
-                n = item["rollouts"]
-                count, read, wrote = played.get(f"train {arm}", (0, 0.0, 0.0))
-                read += n * row.get("episode/input_tokens", 0.0)
-                played[f"train {arm}"] = (count + n, read, wrote + n * row.get("episode/output_tokens", 0.0))
+            log, n = _log(folder / run), item["rollouts"] * len(_lines(folder / run / UPDATES))  # one receipt a round
+            read, wrote = (n * _mean(log, f"episode/{name}_tokens") for name in ("input", "output"))
+            before = played.get(f"train {arm}", (0, 0.0, 0.0))
+            played[f"train {arm}"] = (before[0] + n, before[1] + read, before[2] + wrote)
     model = [r for r in rows if r["status"] == "completed" and r.get("input_tokens")]
     sums = [float(sum(r.get(name) or 0 for r in model)) for name in ("input_tokens", "output_tokens")]
     played["evaluation"] = (len(model), sums[0], sums[1])
@@ -106,6 +108,12 @@ def taken(rows: Sequence[Row], study: Mapping[str, Any], folder: Path) -> list[B
     )
     header = ["what", "episodes", "tokens in", "tokens out", "CPU hours"]
     return [Heading("What it took", 3), Table(header, body, caption)]
+
+
+def _mean(rows: Sequence[Row], name: str) -> float:
+    """Of the rows that have a number of this name; 0 where none has."""
+    values = [row[name] for row in rows if row.get(name) is not None]
+    return math.fsum(values) / len(values) if values else 0.0
 
 
 def audits(study: Mapping[str, Any]) -> list[Block]:

@@ -15,9 +15,8 @@ from agentspec.metrics import Metric, primary_metric
 from eval.report.blocks import Block, Heading, Table, Text
 from eval.report.captions import LEVEL, unit_of
 from eval.report.training import audits, read_study, taken, trained
-from eval.statistics import LEAST_RUNS, Estimate, compare_runs, corrected, runs_mean
-from eval.tables import show, show_p, values_by_run
-from eval.transfer import Cells, at_home, diagonal
+from eval.statistics import LEAST_RUNS, Cells, Diagonal, Estimate, at_home, compare_runs, corrected, diagonal, runs_mean
+from eval.tables import VERDICTS, show, show_p, values_by_run
 
 Row = Mapping[str, Any]
 START = "start"
@@ -33,8 +32,10 @@ def transfer_section(rows: Sequence[Row], folder: Path) -> list[Block]:
     for row in rows:
         grouped.setdefault((row["policy"], row["scaffold"]), []).append(row)
     values = {cell: values_by_run(members, metric.name) for cell, members in grouped.items()}
+    lacking = [arm for arm in home if not any(arm == policy for policy, _ in values)]
     return [
         Heading("Training and transfer"),
+        *([Text(f"No run of {', '.join(lacking)} was evaluated: left out of all tables.")] if lacking else []),
         *_paper_form(rows, study, values, metric),
         _matrix(rows, home, values, metric),
         *_diagonal(home, values, metric),
@@ -50,8 +51,13 @@ Values = Mapping[tuple[str, str], Mapping[str, Mapping[str, float]]]
 """(policy, scaffold) -> training run -> task -> value."""
 
 
+def _played(values: Values, policy: str, scaffold: str) -> list[Mapping[str, float]]:
+    """Values by task of the runs that completed an episode there."""
+    return [v for v in values.get((policy, scaffold), {}).values() if v]
+
+
 def _estimate(values: Values, policy: str, scaffold: str) -> Estimate | None:
-    runs = [v for v in values.get((policy, scaffold), {}).values() if v]
+    runs = _played(values, policy, scaffold)
     return runs_mean(runs, level=LEVEL) if runs else None
 
 
@@ -102,13 +108,14 @@ def _matrix(rows: Sequence[Row], home: Mapping[str, str], values: Values, metric
 
 
 def _diagonal(home: Mapping[str, str], values: Values, metric: Metric) -> list[Block]:
-    home = {arm: scaffold for arm, scaffold in home.items() if scaffold}
-    homes = list(dict.fromkeys(home.values()))
-    runs = {arm: sorted({run for s in homes for run in values.get((arm, s), {})}) for arm in home}
+    runs: dict[str, list[str]] = {}
+    for (policy, _), played in values.items():
+        if home.get(policy):  # not dealt out over several
+            runs[policy] = sorted({*runs.get(policy, ()), *played})
+    homes = list(dict.fromkeys(home[arm] for arm in runs))
     cells: Cells = {
         arm: {run: {s: values.get((arm, s), {}).get(run, {}) for s in homes} for run in found}
         for arm, found in runs.items()
-        if found
     }
     heading = Heading("Is a policy best where it was trained?", 3)
     try:
@@ -119,20 +126,26 @@ def _diagonal(home: Mapping[str, str], values: Values, metric: Metric) -> list[B
     tested = corrected([found.estimate, *own.values()])
     names = ["diagonal less the rest", *(f"{s}: trained there less trained elsewhere" for s in own)]
     body = [[name, *_difference(e, metric)] for name, e in zip(names, tested, strict=True)]
-    lowest = 1 / found.assignments
     caption = (
-        f"Differences in {metric.heading}; {LEVEL:.0%} t intervals, p corrected by Holm over this table. First row: a "
-        "policy at home less the same policy in the other homes; how hard a scaffold is and how well an arm has learnt "
-        "cancel (Satterthwaite's t over training runs). The others compare policies in one scaffold (Welch's t over "
-        f"training runs), so how well an arm has learnt altogether is in them. With fewer than {LEAST_RUNS} runs of an "
-        "arm: over tasks, this checkpoint only."
+        f"Differences in {metric.heading}; {LEVEL:.0%} t intervals, p corrected by Holm over this table; {VERDICTS}. "
+        "First row: a policy at home less the same policy in the other homes; how hard a scaffold is and how well an "
+        "arm has learnt cancel. The others compare policies in one scaffold, so how well an arm has learnt altogether "
+        "is in them. Each arm is a sample of runs (Satterthwaite's t); with fewer than "
+        f"{LEAST_RUNS} runs of an arm: over tasks (sign-flip test), this checkpoint only."
     )
-    text = (
-        f"Permutation of homes: of {found.assignments} assignments of homes to policies, a share of "
-        f"{found.permutation:.3f} has a diagonal as far from 0 as the real one (it cannot be below {lowest:.3g}; not "
-        "corrected)."
+    table = Table(["difference", "mean", "p", "verdict", "n"], body, caption)
+    return [heading, table, Text(_permuted(found, len(homes)))]
+
+
+def _permuted(found: Diagonal, homes: int) -> str:
+    if math.isnan(found.permutation):
+        return f"Permutation of homes: not possible with {homes} homes, all of whose assignments are as far from 0."
+    some = "" if found.tried == found.assignments else f" {found.tried:,} drawn at random from"
+    return (
+        f"Permutation of homes: of{some} {found.assignments:,} assignments of homes to policies, a share of "
+        f"{show_p(found.permutation)} has a diagonal as far from 0 as the real one (it cannot be below "
+        f"{found.least:.2g}; not corrected)."
     )
-    return [heading, Table(["difference", "mean", "p", "verdict", "n"], body, caption), Text(text)]
 
 
 def _difference(estimate: Estimate, metric: Metric) -> list[str]:
@@ -149,8 +162,8 @@ def _verdict(estimate: Estimate) -> str:
 def _gains(home: Mapping[str, str], values: Values, metric: Metric) -> list[Block]:
     """Every arm less the start, in every scaffold."""
     found = {
-        (arm, s): compare_runs([*filter(None, after.values())], [*filter(None, values[START, s].values())], level=LEVEL)
-        for (arm, s), after in values.items()
+        (arm, s): compare_runs(_played(values, arm, s), _played(values, START, s), fixed=True, level=LEVEL)
+        for arm, s in values
         if arm in home and (START, s) in values
     }
     if not found:
@@ -160,9 +173,10 @@ def _gains(home: Mapping[str, str], values: Values, metric: Metric) -> list[Bloc
         for (arm, s), e in zip(found, corrected([*found.values()]), strict=True)
     ]
     caption = (
-        f"Gain over the start in {metric.heading}, on the same tasks; over training runs (fewer than {LEAST_RUNS}: "
+        f"Gain over the start in {metric.heading}, on the same tasks. All runs begin with the start, so it is a "
+        f"constant and each run has one gain: t over training runs (fewer than {LEAST_RUNS}: sign-flip test over "
+        f"tasks, this checkpoint only); p corrected by Holm over this table; {VERDICTS}."
     )
-    caption += "over tasks, this checkpoint only); p corrected by Holm over this table."
     return [
         Heading("What training gained", 3),
         Table(["trained", "evaluated in", "gain", "p", "verdict", "n"], body, caption),
@@ -175,17 +189,19 @@ def _comparisons(rows: Sequence[Row], study: Mapping[str, Any], values: Values, 
     for name, (a, b) in (study.get("compare") or {}).items():
         for scaffold in dict.fromkeys(r["scaffold"] for r in rows):
             if (a, scaffold) in values and (b, scaffold) in values:
-                first, second = ([*filter(None, values[p, scaffold].values())] for p in (a, b))
+                sides = _played(values, b, scaffold), _played(values, a, scaffold)
                 names = [name, f"{b} - {a}", scaffold, _memory_calls(rows, b, scaffold)]
-                found.append((names, compare_runs(second, first, level=LEVEL)))
+                fixed = not {a, b} <= set(study["arms"])  # the start, or a scripted policy
+                found.append((names, compare_runs(*sides, fixed=fixed, level=LEVEL)))
     if not found:
         return []
     tested = corrected([e for _, e in found])
     body = [[*names, *_difference(e, metric)] for (names, _), e in zip(found, tested, strict=True)]
     caption = (
-        f"Differences in {metric.heading} between two trained policies; Welch's t over training runs, p corrected by "
-        "Holm over this table. Memory calls: of the first-named policy, per episode (in a scaffold with summaries, how "
-        "many it wrote)."
+        f"Differences in {metric.heading} between two policies; Welch's t over training runs (fewer than {LEAST_RUNS} "
+        "of an arm: sign-flip test over tasks, this checkpoint only), p corrected by Holm over this table; "
+        f"{VERDICTS}. Memory calls: of the first-named policy, per episode (in a scaffold with summaries, how many it "
+        "wrote)."
     )
     header = ["question", "difference", "evaluated in", "memory calls/episode", "mean", "p", "verdict", "n"]
     return [Heading("Compared in pairs", 3), Table(header, body, caption)]

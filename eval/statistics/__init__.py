@@ -8,11 +8,13 @@ Two kinds of chance must be kept apart:
 - *Training runs.* Another run of the same recipe gives another checkpoint. Statements about a recipe need at least
   `LEAST_RUNS` runs, and the unit is the run (`runs_mean`, `compare_runs`). Tests over task seeds alone would call the
   luck of a run an effect: with a run-to-run deviation of half an episode's, they do so in most comparisons of equal
-  recipes.
+  recipes. One run is no recipe either: only a policy that all runs have in common (the start they begin with, an
+  expert) may stand against several runs as a constant.
 
 Percentile bootstrap intervals are too narrow for few values, so they are offered from `LEAST_BOOTSTRAP` seeds on
-(`bootstrap`, `interquartile_mean`). Several tests of one table are corrected by Holm's method (`holm`). A difference
-whose corrected p-value is above the level is a tie, and is printed as one. The simulations behind these choices are
+(`bootstrap`, `interquartile_mean`). Several tests of one table are corrected by Holm's method (`holm`). The corrected
+p-value decides, and not the interval, which is uncorrected and over tasks not of the same test: a difference whose
+corrected p-value is above the level is a tie, and is printed as one. The simulations behind these choices are
 tests (`tests/eval/test_coverage.py`).
 
 Distributions come from SciPy, regressions from statsmodels: `pip install 'agentspec-rl[eval]'`.
@@ -34,7 +36,8 @@ from eval.statistics.estimates import (
     sign_flip,
 )
 from eval.statistics.resampling import LEAST_BOOTSTRAP, bootstrap, interquartile_mean, performance_profile
-from eval.statistics.runs import LEAST_RUNS, compare_runs, paired_runs, runs_mean
+from eval.statistics.runs import LEAST_RUNS, compare_runs, paired_runs, runs_mean, weighted_runs
+from eval.statistics.transfer import Cells, Diagonal, at_home, contrasts, diagonal
 
 __all__ = [
     "EXACT_FLIPS",
@@ -42,10 +45,15 @@ __all__ = [
     "LEAST_RUNS",
     "LEVEL",
     "RESAMPLES",
+    "Cells",
+    "Diagonal",
     "Estimate",
+    "at_home",
     "bootstrap",
     "compare_runs",
+    "contrasts",
     "corrected",
+    "diagonal",
     "holm",
     "interactions",
     "interquartile_mean",
@@ -57,4 +65,5 @@ __all__ = [
     "performance_profile",
     "runs_mean",
     "sign_flip",
+    "weighted_runs",
 ]

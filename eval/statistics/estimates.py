@@ -21,6 +21,10 @@ EXACT_FLIPS = 14
 ones."""
 
 
+THESE = "this checkpoint only"
+"""Note of what is said over tasks: it holds for the checkpoints at hand, not for their recipe."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A mean (or other location) over `n` units and its interval; NaN where there is nothing to estimate from.
@@ -40,7 +44,11 @@ class Estimate:
     note: str = ""
 
     def tie(self, level: float = LEVEL) -> bool:
-        """Whether no difference was shown at `level`: the p-value where there is one, else the interval, decides."""
+        """Whether no difference was shown at `level`: the p-value where there is one, else the interval, decides.
+
+        The two may disagree: p-values are corrected over their table and intervals are not, and over tasks p is of a
+        sign-flip test and the interval Student's.
+        """
         if not math.isnan(self.p):
             return self.p > 1 - level
         return math.isnan(self.low) or self.low <= 0 <= self.high
@@ -80,9 +88,12 @@ def paired(a: Mapping[K, float], b: Mapping[K, float], *, level: float = LEVEL, 
         a, b: value by task seed (repeats averaged before); seeds of one side only are left out.
         seed: of the random flips, where there are too many values for all.
     """
-    differences = [a[key] - b[key] for key in a if key in b]
-    estimate = mean_interval(differences, level=level)
-    return replace(estimate, p=sign_flip(differences, seed=seed), note="this checkpoint only")
+    return over_tasks([a[key] - b[key] for key in a if key in b], level=level, seed=seed)
+
+
+def over_tasks(differences: Values, *, level: float = LEVEL, seed: int = 0) -> Estimate:
+    """Mean of one difference per task: t interval and sign-flip test, about the checkpoints at hand."""
+    return replace(mean_interval(differences, level=level), p=sign_flip(differences, seed=seed), note=THESE)
 
 
 def sign_flip(values: Values, *, seed: int = 0) -> float:

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from eval.statistics.estimates import LEVEL, Estimate, K, Values, finite, mean_interval, paired
+from eval.statistics.estimates import LEVEL, THESE, Estimate, K, Values, finite, mean_interval, over_tasks
 
 R = TypeVar("R", bound=Hashable)
 
@@ -28,31 +28,33 @@ def runs_mean(runs: Sequence[Mapping[K, float]], *, level: float = LEVEL) -> Est
         return Estimate(math.nan, math.nan, math.nan, 0, "run", note="no task that all runs have")
     if len(runs) < LEAST_RUNS:
         seeds = [math.fsum(run[key] for run in runs) / len(runs) for key in common] if runs else []
-        return replace(mean_interval(seeds, level=level), note="this checkpoint only")
+        return replace(mean_interval(seeds, level=level), note=THESE)
     return mean_interval([_mean(run, common) for run in runs], level=level, unit="run")
 
 
 def compare_runs(
-    a: Sequence[Mapping[K, float]], b: Sequence[Mapping[K, float]], *, level: float = LEVEL, seed: int = 0
+    a: Sequence[Mapping[K, float]],
+    b: Sequence[Mapping[K, float]],
+    *,
+    fixed: bool = False,
+    level: float = LEVEL,
+    seed: int = 0,
 ) -> Estimate:
     """Difference of two recipes' means over their training runs, on the task seeds that all runs have.
 
-    With `LEAST_RUNS` runs on both sides: Welch's t interval and test over runs. If one side is a fixed policy that was
-    not trained (a start, an expert), pass it as one run: the unit is then the run of the other side, one sample.
-    Otherwise the runs at hand are compared over seeds, and the note says `this checkpoint only`.
+    With `LEAST_RUNS` runs on both sides: Welch's t interval and test over runs. Otherwise the runs at hand are compared
+    over seeds, and the note says `this checkpoint only`.
+
+    Args:
+        fixed: a side of one run is no draw of a recipe but the same policy for every run of the other side: the start
+            they begin with, an expert. The unit is then the run of the other side, one sample. (Where it is a draw,
+            its own luck is in no run's deviation: 24 % of such tests find a difference of equal recipes.)
     """
-    if len(a) == 1 and len(b) >= LEAST_RUNS:
-        turned = compare_runs(b, a, level=level, seed=seed)
-        return replace(turned, mean=-turned.mean, low=-turned.high, high=-turned.low)
-    if not a or not b:
-        return Estimate(math.nan, math.nan, math.nan, 0, note="one side has no run with a value")
-    common = _common([*a, *b])
-    if len(a) >= LEAST_RUNS and (len(b) == 1 or len(b) >= LEAST_RUNS):
-        if not common:
-            return Estimate(math.nan, math.nan, math.nan, 0, "run")
-        return _welch([_mean(run, common) for run in a], [_mean(run, common) for run in b], level)
-    sides = [{key: math.fsum(run[key] for run in side) / max(1, len(side)) for key in common} for side in (a, b)]
-    return paired(*sides, level=level, seed=seed)
+    if fixed and min(len(a), len(b)) == 1:
+        gains = [{key: x[key] - y[key] for key in x if key in y} for x in a for y in b]
+        return weighted_runs([(1.0, gains)], level=level, seed=seed)
+    found = weighted_runs([(1.0, a), (-1.0, b)], level=level, seed=seed)
+    return replace(found, n=min(len(a), len(b))) if found.unit == "run" and found.n else found
 
 
 def paired_runs(
@@ -63,34 +65,51 @@ def paired_runs(
     With `LEAST_RUNS` runs on both sides each run gives one difference (over its task seeds): a t interval over the
     runs and its test. With fewer the runs at hand are compared over seeds, and the note says so.
     """
-    both = [run for run in a if run in b]
-    common = _common([side[run] for run in both for side in (a, b)])
-    if len(both) >= LEAST_RUNS:
+    both = [{key: a[run][key] - b[run][key] for key in a[run] if key in b[run]} for run in a if run in b]
+    return weighted_runs([(1.0, both)], level=level, seed=seed)
+
+
+def weighted_runs(
+    samples: Sequence[tuple[float, Sequence[Mapping[K, float]]]], *, level: float = LEVEL, seed: int = 0
+) -> Estimate:
+    """A weighted sum of recipes' means over their training runs, on the task seeds that all runs have.
+
+    With `LEAST_RUNS` runs of each: the runs of a recipe are an independent sample with a variance of its own; t
+    interval and test with Satterthwaite's degrees of freedom (of two samples Welch's, of one Student's). Otherwise over
+    seeds, and the note says `this checkpoint only`.
+
+    Args:
+        samples: weight and runs of each recipe.
+    """
+    if not all(runs for _, runs in samples):
+        return Estimate(math.nan, math.nan, math.nan, 0, note="one side has no run with a value")
+    common = _common([run for _, runs in samples for run in runs])
+    if min(len(runs) for _, runs in samples) >= LEAST_RUNS:
         if not common:
-            return Estimate(math.nan, math.nan, math.nan, 0, "run")
-        return _welch([_mean(a[run], common) - _mean(b[run], common) for run in both], [0.0], level)
-    sides = [{key: math.fsum(side[run][key] for run in both) / max(1, len(both)) for key in common} for side in (a, b)]
-    return paired(*sides, level=level, seed=seed)
+            return Estimate(math.nan, math.nan, math.nan, 0, "run", note="no task that all runs have")
+        return _satterthwaite([(weight, [_mean(run, common) for run in runs]) for weight, runs in samples], level)
+    means = [(weight, {k: math.fsum(run[k] for run in runs) / len(runs) for k in common}) for weight, runs in samples]
+    return over_tasks([math.fsum(weight * of[key] for weight, of in means) for key in common], level=level, seed=seed)
 
 
-def _welch(a: Values, b: Values, level: float) -> Estimate:
-    """Welch's unequal-variances t interval and test of the difference of two means; a lone `b` is taken as exact.
+def _satterthwaite(samples: Sequence[tuple[float, Values]], level: float) -> Estimate:
+    """A weighted sum of the means of independent samples.
 
-    Where no side varies beyond float noise there is nothing to test: `p` is 1 for equal means, else 0.
+    Where no sample varies beyond float noise there is nothing to test: `p` is 1 for 0, else 0.
     """
     from scipy import stats
 
-    x, y = finite(a, level), finite(b, level)
-    noise = 1e-12 * max(1.0, float(np.abs([*x, *y]).max()))
-    mean = float(x.mean() - y.mean())
-    if np.ptp(x) <= noise and np.ptp(y) <= noise:
-        return Estimate(mean, mean, mean, min(n for n in (x.size, y.size) if n > 1), "run", float(abs(mean) <= noise))
-    if y.size == 1:
-        estimate = mean_interval([float(gain) for gain in x - y], level=level, unit="run")
-        return replace(estimate, p=float(stats.ttest_1samp(x - y, 0.0).pvalue))
-    found = stats.ttest_ind(x, y, equal_var=False)
-    interval = found.confidence_interval(confidence_level=level)
-    return Estimate(mean, float(interval.low), float(interval.high), min(x.size, y.size), "run", float(found.pvalue))
+    weighted = [(weight, finite(values, level)) for weight, values in samples]
+    mean = math.fsum(weight * float(x.mean()) for weight, x in weighted)
+    count = sum(x.size for _, x in weighted)
+    noise = 1e-12 * max(1.0, *(float(np.abs(x).max()) for _, x in weighted))
+    if all(np.ptp(x) <= noise for _, x in weighted):
+        return Estimate(mean, mean, mean, count, "run", float(abs(mean) <= noise))
+    parts = [weight**2 * float(x.var(ddof=1)) / x.size for weight, x in weighted]
+    freedom = sum(parts) ** 2 / sum(part**2 / (x.size - 1) for part, (_, x) in zip(parts, weighted, strict=True))
+    error = math.sqrt(sum(parts))
+    half = float(stats.t.ppf((1 + level) / 2, freedom)) * error
+    return Estimate(mean, mean - half, mean + half, count, "run", float(2 * stats.t.sf(abs(mean) / error, freedom)))
 
 
 def _common(runs: Sequence[Mapping[K, float]]) -> list[K]:

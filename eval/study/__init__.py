@@ -1,4 +1,4 @@
-"""Learning studies: what is trained and played (`plan`), and what that takes (`cost`)."""
+"""Learning studies: what is trained and played (`plan`), what that takes (`cost`), and the matrix (`playing`)."""
 
 from eval.study.plan import Arm, Study, read_study
 

@@ -9,7 +9,6 @@ the episode began with, and the static beginning, are not read again. Hours are 
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,6 +21,7 @@ from agentspec.parameters import check_types
 from agentspec.policies import Policy
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
+from agentspec.tokens import shared_prefix
 from agentspec.trajectory import Trajectory
 from agentspec.types import CallTag, Sampling, Task
 from eval.matrix import kept_episodes
@@ -114,7 +114,7 @@ def work_of(spec: AgentSpec, tokenizer: Any, tasks: Sequence[Task], player: str)
         here = list(static.values())
         for call in episode.calls:
             static.setdefault(call.tag.path, call.prompt_ids)
-            read += len(call.prompt_ids) - max((_common(call.prompt_ids, earlier) for earlier in here), default=0)
+            read += len(call.prompt_ids) - max((shared_prefix(call.prompt_ids, earlier) for earlier in here), default=0)
             for completion in call.completions:
                 free = [a is None or len(a) > 1 for a in completion.allowed or (None,) * len(completion.token_ids)]
                 write += sum(free)
@@ -125,10 +125,6 @@ def work_of(spec: AgentSpec, tokenizer: Any, tasks: Sequence[Task], player: str)
 
 def _steps(episodes: Sequence[Trajectory]) -> float:
     return sum(len(e.transitions) for e in episodes) / len(episodes)
-
-
-def _common(a: Sequence[int], b: Sequence[int]) -> int:
-    return next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
 
 
 @dataclass(frozen=True)
@@ -255,9 +251,3 @@ def _detectable(study: Study) -> Iterable[str]:
 
 def _span(hours: Sequence[float]) -> str:
     return f"{hours[0]:.2f}-{hours[1]:.2f}"
-
-
-def cpu_seconds() -> float:
-    """CPU seconds of this process so far, all threads."""
-    times = os.times()
-    return times.user + times.system

@@ -32,6 +32,7 @@ from typing import Any
 from agentspec.actions import suggest
 from agentspec.parameters import check_types
 from agentspec.policies import Policy
+from agentspec.records.folder import MANIFEST, SEAL
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from eval.cells import Settings
@@ -39,8 +40,8 @@ from eval.naming import slug
 
 START = "start"
 """The policy that all arms begin with."""
-TRAINERS = {"grpo": "grpo_delivery", "supo": "supo_delivery", "memory": "grpo_memory"}
-"""`trainer` of an arm -> the recipe that trains it."""
+TRAINERS = ("grpo", "supo", "memory")
+"""What `trainer` of an arm may be; who runs a study knows how each trains."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,6 @@ class Arm:
     def home(self) -> str:
         """The scaffold it is trained in; empty if its groups are dealt out over several (`scaffolds`)."""
         return "" if "scaffolds" in self.fields else self.scaffold
-
-    @property
-    def recipe(self) -> str:
-        """The recipe that trains it."""
-        return TRAINERS[self.trainer]
 
 
 @dataclass(frozen=True)
@@ -103,12 +99,12 @@ class Study:
     @property
     def begun(self) -> list[tuple[str, int]]:
         """(arm, seed) of the training runs that have left anything."""
-        return [run for run in self.runs if (self.folder(*run) / "manifest.json").is_file()]
+        return [run for run in self.runs if (self.folder(*run) / MANIFEST).is_file()]
 
     @property
     def ended(self) -> list[tuple[str, int]]:
         """(arm, seed) of the training runs that have come to their ends."""
-        return [run for run in self.runs if (self.folder(*run) / "seal.json").is_file()]
+        return [run for run in self.runs if (self.folder(*run) / SEAL).is_file()]
 
     @property
     def start(self) -> Path | None:

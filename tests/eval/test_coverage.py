@@ -87,6 +87,56 @@ def test_recipes_are_compared_over_runs(runs):
     assert 0.02 <= share(e.p <= 0.05 for e in found) <= 0.07
 
 
+def trained(rng, tasks, arms, runs, scaffolds):
+    """arm -> run -> scaffold -> task -> value of equal recipes: a task's difficulty, the run's luck, the episode's."""
+    day = rng.normal(0, 3, (scaffolds, tasks))
+    return {
+        a: {
+            r: {s: dict(enumerate(day[s] + luck + rng.normal(0, 1, tasks))) for s in range(scaffolds)}
+            for r in range(runs)
+            for luck in [0.5 * rng.normal()]
+        }
+        for a in range(arms)
+    }
+
+
+@pytest.mark.parametrize("runs", [3, 5])
+def test_runs_against_the_start_they_begin_with_err_as_they_say(runs):
+    """The start is a constant of all runs. Another recipe's only run is not: so treated it errs far more often."""
+    rng = np.random.default_rng(runs)
+    constant, drawn = [], []
+    for _ in range(SIMULATIONS):
+        day = rng.normal(0, 3, 16)
+        start = dict(enumerate(day + rng.normal(0, 1, 16)))
+        arm = [{t: v + 0.5 * luck + noise[t] for t, v in start.items()} for luck in rng.normal(0, 1, runs)
+               for noise in [rng.normal(0, 1, 16)]]  # fmt: skip
+        constant.append(statistics.compare_runs(arm, [start], fixed=True))
+        lone, *others = trained(rng, 16, 1, 1 + runs, 1)[0].values()
+        sides = [run[0] for run in others], [lone[0]]
+        drawn.append(statistics.compare_runs(*sides, fixed=True))
+    assert 0.03 <= share(e.p <= 0.05 for e in constant) <= 0.07
+    assert 0.93 <= share(e.low <= 0 <= e.high for e in constant) <= 0.97
+    assert share(e.p <= 0.05 for e in drawn) > 0.15
+    assert statistics.compare_runs(*sides).note == "this checkpoint only"
+
+
+@pytest.mark.parametrize("runs", [3, 5])
+def test_the_diagonal_and_who_was_trained_at_home_err_as_they_say(runs):
+    rng = np.random.default_rng(runs + 10)
+    diagonals, own, permuted = [], [], []
+    homes = dict(enumerate(range(4)))
+    for _ in range(SIMULATIONS):
+        cells = trained(rng, 16, 4, runs, 4)
+        found = statistics.diagonal(cells, homes)
+        diagonals.append(found.estimate)
+        permuted.append(found.permutation)
+        own.append(statistics.at_home(cells, homes)[0])
+    for found in (diagonals, own):
+        assert 0.03 <= share(e.p <= 0.05 for e in found) <= 0.07
+        assert 0.93 <= share(e.low <= 0 <= e.high for e in found) <= 0.97
+    assert 0.02 <= share(p <= 0.05 for p in permuted) <= 0.07
+
+
 def test_seeds_alone_would_call_luck_between_runs_an_effect():
     """Why runs are the unit: one run of each of two equal recipes, run deviation half of an episode's, 32 seeds."""
     rng = np.random.default_rng(0)

@@ -30,6 +30,7 @@ from eval.statistics import (
     performance_profile,
     runs_mean,
     sign_flip,
+    weighted_runs,
 )
 
 some = st.lists(st.floats(-100, 100), min_size=2, max_size=9)
@@ -116,9 +117,24 @@ def test_two_recipes_are_compared_by_welch_over_runs():
 
 def test_runs_against_a_fixed_policy_are_one_sample():
     start = [{0: 1.0, 1: 1.0}]
-    found = compare_runs([{0: 2.0, 1: 2.0}, {0: 3.0, 1: 3.0}, {0: 4.0, 1: 4.0}], start)
-    assert (found.mean, found.unit) == (2.0, "run")
+    runs = [{0: 2.0, 1: 2.0}, {0: 3.0, 1: 3.0}, {0: 4.0, 1: 4.0}]
+    found = compare_runs(runs, start, fixed=True)
+    assert (found.mean, found.unit, found.n) == (2.0, "run", 3)
     assert found.p == pytest.approx(stats.ttest_1samp([1.0, 2.0, 3.0], 0).pvalue)
+    # The only run of another recipe is a draw of it: what is said is about the runs at hand, over tasks.
+    drawn = compare_runs(runs, start)
+    assert (drawn.mean, drawn.unit, drawn.n, drawn.note) == (2.0, "seed", 2, "this checkpoint only")
+
+
+def test_a_weighted_sum_of_recipes_is_satterthwaite_s() -> None:
+    """Of two samples Welch's; of three: by hand."""
+    x, y, z = [1.0, 2.0, 3.0], [4.0, 4.0, 10.0], [0.0, 6.0, 0.0, 6.0]
+    found = weighted_runs([(w, [{0: v} for v in values]) for w, values in ((1.0, x), (-0.5, y), (-0.5, z))])
+    # 2 - 3 - 1.5. Variances of the means: 1/3; (12/3)/4 = 1; (12/4)/4 = 3/4.
+    error, freedom = (1 / 3 + 1 + 3 / 4) ** 0.5, (25 / 12) ** 2 / (1 / 9 / 2 + 1 / 2 + 9 / 16 / 3)
+    assert found.mean == pytest.approx(-2.5) and (found.n, found.unit) == (10, "run")
+    assert found.p == pytest.approx(2 * stats.t.sf(2.5 / error, freedom))
+    assert found.high - found.mean == pytest.approx(stats.t.ppf(0.975, freedom) * error)
 
 
 def test_too_few_runs_speak_of_themselves():
@@ -129,32 +145,32 @@ def test_too_few_runs_speak_of_themselves():
 def test_runs_without_any_spread():
     same = [{0: 1.0}] * 3
     assert compare_runs(same, same).p == 1.0 and compare_runs(same, [{0: 0.0}] * 3).p == 0.0
-    assert compare_runs(same, [{0: 0.0}]).p == 0.0
+    assert compare_runs(same, [{0: 0.0}], fixed=True).p == 0.0
 
 
 def test_runs_that_are_equal_up_to_float_noise_are_a_tie() -> None:
     # 0.1 + 0.2 is 0.3 + 5.6e-17; no run differs from another of its side.
     noisy, plain = [{0: 0.1 + 0.2}] * 3, [{0: 0.3}] * 3
-    assert compare_runs(noisy, plain).tie() and compare_runs(noisy, plain[:1]).tie()
-    assert compare_runs([*noisy[:1], *plain[:2]], plain[:1]).tie()
+    assert compare_runs(noisy, plain).tie() and compare_runs(noisy, plain[:1], fixed=True).tie()
+    assert compare_runs([*noisy[:1], *plain[:2]], plain[:1], fixed=True).tie()
 
 
 def test_runs_without_a_common_task_show_nothing() -> None:
     for b in ([{1: 1.0}], [{1: 1.0}] * 3):
-        found = compare_runs([{0: 2.0}] * 3, b)
+        found = compare_runs([{0: 2.0}] * 3, b, fixed=True)
         assert found.n == 0 and math.isnan(found.mean) and math.isnan(found.p) and found.tie()
 
 
 def test_a_run_with_a_value_that_is_no_number_is_refused() -> None:
     for b in ([{0: 1.0}], [{0: 1.0}] * 3):
         with pytest.raises(ValueError, match="finite"):
-            compare_runs([{0: math.nan}] * 3, b)
+            compare_runs([{0: math.nan}] * 3, b, fixed=True)
 
 
 def test_it_does_not_matter_which_side_is_the_recipe() -> None:
     recipe = [{k: float(k + gain) for k in range(8)} for gain in (1, 2, 6)]
     fixed = [{k: float(k) for k in range(8)}]
-    ours, theirs = compare_runs(recipe, fixed), compare_runs(fixed, recipe)
+    ours, theirs = compare_runs(recipe, fixed, fixed=True), compare_runs(fixed, recipe, fixed=True)
     assert (theirs.mean, theirs.low, theirs.high) == (-ours.mean, -ours.high, -ours.low)
     assert (theirs.p, theirs.n, theirs.unit) == (ours.p, 3, "run") and ours.p > 0.05
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from agentspec.files import append_lines, write_lines
+from agentspec.metrics import columns
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.types import Task
@@ -17,6 +18,7 @@ from eval.report.blocks import Table, Text
 from eval.statistics import minimum_detectable_effect
 from eval.study import read_study
 from eval.study.cost import Rates, Rounds, Work, plan, work_of
+from eval.tables import VERDICTS
 
 STUDY: dict[str, Any] = {
     "out": "runs/x",
@@ -29,7 +31,7 @@ STUDY: dict[str, Any] = {
 
 def test_a_study_is_read() -> None:
     study = read_study({**STUDY, "evaluation": {"concurrency": 2, "backend": {"dtype": "bfloat16"}}})
-    assert study.arms["b"].recipe == "grpo_memory" and study.arms["b"].fields == {"max_steps": 3}
+    assert (study.arms["b"].trainer, study.arms["b"].fields) == ("memory", {"max_steps": 3})
     # Seed by seed: who stops early has whole replicates.
     assert study.runs[:3] == [("a", 0), ("b", 0), ("a", 1)]
     assert study.settings.concurrency == 2 and study.ended == []
@@ -130,7 +132,9 @@ def reported(folder: Path, runs: int) -> list[Any]:
     for arm, home in (("a", "x"), ("b", "y")):
         places = {str(run): f"runs/{arm}{run}" for run in range(runs)}
         for place in places.values():
-            append_lines(folder / place / "metrics.jsonl", {"step": 1, "reward": 0.0, **logged})
+            # Two steps of one generation round (`num_iterations: 2`): a line of the log each, one receipt.
+            append_lines(folder / place / "metrics.jsonl", *({"step": s, "reward": 0.0, **logged} for s in (1, 2)))
+            append_lines(folder / place / "updates.jsonl", {"round": 1})
         arms[arm] = {"scaffold": home, "trainer": "grpo", "rollouts": 6, "runs": places}
     audits = {"a0": {"updates": 1, "violations": ["row 3 was edited"], "notes": [], "head": "abc"}}
     told = {"arms": arms, "audits": audits, "table": {"Non-RL": "start", "GRPO": "a"}, "compare": {"which": ["a", "b"]}}
@@ -155,7 +159,7 @@ def test_the_report_of_a_study(tmp_path: Path) -> None:
     # Contrasts of a: 4, 4.1, 4.2; of b: 4, 3.9, 3.8. Their mean over homes is 4.
     assert tested["diagonal less the rest"][1].startswith("4.00 [")
     assert tested["diagonal less the rest"][3:] == ["higher", "6 runs"]
-    assert any("of 2 assignments of homes" in b.text for b in blocks if isinstance(b, Text))
+    assert any("not possible with 2 homes" in b.text for b in blocks if isinstance(b, Text))
     pairs = table(blocks, "question", "memory calls/episode")
     assert pairs["which"][1] == "b - a"
     assert table(blocks, "trained", "advantage mass")["a"][1:6] == ["memory.m/write", "3", "10", "0.25", "1.500"]
@@ -179,3 +183,67 @@ def test_results_without_a_study_have_no_such_section(tmp_path: Path) -> None:
     reported(tmp_path, runs=3)
     (tmp_path / "study.json").unlink()
     assert not any(isinstance(b, Table) and "trained in" in b.header for b in build_report(tmp_path).blocks)
+
+
+def test_the_corrected_p_decides_every_verdict(tmp_path: Path) -> None:
+    """Over tasks p is of a sign-flip test and the interval Student's: they disagree in both directions."""
+    from eval.report.transfer import _difference
+    from eval.statistics import paired
+    from eval.tables import difference_rows, differences
+
+    metric = next(m for m in columns([{"env": "deliverybench", "net_earnings": 1.0}]) if m.name == "net_earnings")
+    # Twelve gains of one sign, one of them huge: of 4,096 flips two are as far, but Student's interval holds 0.
+    higher = {str(t): 0.1 if t else 50.0 for t in range(12)}
+    # Four equal gains: the interval is a point, and of eight flips of four, two are as far.
+    tie = {str(t): 1.0 for t in range(4)}
+    for gains, verdict in ((higher, "higher"), (tie, "tie")):
+        e = paired(gains, dict.fromkeys(gains, 0.0))
+        assert (e.low <= 0 <= e.high) == (verdict == "higher") and (e.p <= 0.05) == (verdict == "higher")
+        assert _difference(e, metric)[2] == verdict
+        rows = [
+            {
+                "tasks": "t",
+                "policy": policy,
+                "scaffold": "s",
+                "task": t,
+                "status": "completed",
+                "y": value * (policy == "b"),
+            }
+            for policy in "ab"
+            for t, value in gains.items()
+        ]
+        assert [line[4] for line in difference_rows(differences(rows, "y"), "policy", 2)[1]] == [verdict]
+    captions = [b.caption for b in reported(tmp_path, runs=2) if isinstance(b, Table) and "verdict" in b.header]
+    assert len(captions) >= 3 and all(VERDICTS in caption for caption in captions)
+
+
+def test_an_arm_without_runs_is_left_out_and_said_so(tmp_path: Path) -> None:
+    reported(tmp_path, runs=3)
+    told = json.loads((tmp_path / "study.json").read_text())
+    told["arms"]["late"] = {"scaffold": "z", "trainer": "grpo", "rollouts": 6, "runs": {}}
+    told["compare"]["late"] = ["late", "a"]
+    (tmp_path / "study.json").write_text(json.dumps(told))
+    blocks = [b for b in build_report(tmp_path).blocks if isinstance(b, Table | Text)]
+    assert any("No run of late was evaluated" in b.text for b in blocks if isinstance(b, Text))
+    assert "late" not in table(blocks, "policy", "trained in") and "late" not in table(blocks, "trained", "gain")
+    assert table(blocks, "difference", "verdict", "n")["diagonal less the rest"][3] == "higher"
+    # Without any run of b there is one home left, and nothing to compare it with.
+    told["arms"]["b"]["runs"] = {}
+    (tmp_path / "study.json").write_text(json.dumps(told))
+    lines = (tmp_path / "results.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "results.jsonl").write_text("".join(line for line in lines if '"policy": "b"' not in line))
+    texts = [b.text for b in build_report(tmp_path).blocks if isinstance(b, Text)]
+    assert any("Not tested: a diagonal needs two scaffolds" in text for text in texts)
+
+
+def test_a_single_run_of_an_arm_is_no_constant(tmp_path: Path) -> None:
+    """Three runs of a against one of b, in pairs and at home: about these checkpoints. The start is a constant."""
+    reported(tmp_path, runs=3)
+    lines = (tmp_path / "results.jsonl").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if (row := json.loads(line))["policy"] != "b" or row["run"] == "0"]
+    (tmp_path / "results.jsonl").write_text("".join(kept))
+    blocks = [b for b in build_report(tmp_path).blocks if isinstance(b, Table | Text)]
+    tested = table(blocks, "difference", "verdict", "n")
+    assert all("this checkpoint only" in row[-1] for row in tested.values()) and len(tested) == 3
+    assert "this checkpoint only" in table(blocks, "question", "memory calls/episode")["which"][-1]
+    assert table(blocks, "trained", "gain")["a"][-1] == "3 runs"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
-from eval.transfer import at_home, contrasts, diagonal
+from eval.statistics import LEAST_RUNS, RESAMPLES, at_home, contrasts, diagonal
 
 HOME = {"a": "x", "b": "y"}
 
@@ -43,7 +44,8 @@ def test_neither_easy_scaffolds_nor_good_learners_are_a_diagonal() -> None:
     # Value = how well the arm has learnt + how easy the scaffold is (y: 10 more), and nothing else.
     found = diagonal(cells([(1, 11), (2, 12), (3, 13)], [(7, 17), (7, 17), (8, 18)]), HOME)
     assert found.estimate.mean == pytest.approx(0) and found.estimate.p == 1 and found.estimate.tie()
-    assert found.permutation == 1
+    # With two homes the other assignment is always as far from 0: that is no test.
+    assert math.isnan(found.permutation) and math.isnan(found.least) and found.assignments == 2
 
 
 def test_fewer_than_three_runs_speak_of_their_checkpoints_only() -> None:
@@ -67,8 +69,21 @@ def test_all_assignments_of_homes_are_counted() -> None:
     found = diagonal(played, arms)
     # Rows less their means: 2 on the diagonal, -1 elsewhere. Six assignments: 6 once (all at home), 0 three times (one
     # at home: 2 - 1 - 1), -3 twice: only the real one is as far from 0.
-    assert (found.permutation, found.assignments) == (pytest.approx(1 / 6), 6)
+    assert (found.permutation, found.assignments, found.least) == (pytest.approx(1 / 6), 6, 1 / 6)
     assert found.estimate.mean == 3 and found.estimate.p == 0  # no run varies
+
+
+@pytest.mark.parametrize(("n", "tried"), [(2, 2), (3, 6), (4, 24), (7, 5040), (8, 1 + RESAMPLES)])
+def test_how_small_the_permutation_can_be(n: int, tried: int) -> None:
+    """A diagonal that stands alone: of all n! assignments, or of those that were drawn at random."""
+    homes = [f"h{i}" for i in range(n)]
+    played = {h: {"0": {s: {"t": float(s == h)} for s in homes}} for h in homes}
+    found = diagonal(played, dict(zip(homes, homes, strict=True)))
+    assert (found.tried, found.assignments) == (tried, math.factorial(n))
+    if n == 2:
+        assert math.isnan(found.permutation) and math.isnan(found.least)
+    else:
+        assert found.permutation == pytest.approx(found.least) == pytest.approx(1 / tried)
 
 
 def test_arms_of_one_home_count_together_once() -> None:
@@ -82,6 +97,27 @@ def test_what_is_compared_in_one_scaffold() -> None:
     own = at_home(cells([(5, 1), (6, 1), (7, 1)], [(4, 3), (4, 5), (4, 7)]), HOME)
     assert own["x"].mean == pytest.approx(2) and own["y"].mean == pytest.approx(4)  # 6 - 4, and 5 - 1
     assert own["x"].unit == own["y"].unit == "run"
+    # Home x has two arms, 6 and 2 on average there, and counts once: 4 - 4. The others: 4 - (1 + 0) / 2.
+    played = {**cells([(5, 1), (6, 1), (7, 1)], [(4, 3), (4, 5), (4, 7)])}
+    played["c"] = {str(i): {"x": {"t": 2.0 + i - 1}, "y": {"t": 0.0}} for i in range(3)}
+    own = at_home(played, {**HOME, "c": "x"})
+    assert (own["x"].mean, own["y"].mean) == (pytest.approx(0), pytest.approx(4.5)) and own["x"].n == 9
+
+
+def test_a_single_run_of_an_arm_is_a_draw_and_no_fixed_policy() -> None:
+    """Against three runs of another it has no deviation of its own: over tasks, and said so."""
+    own = at_home(cells([(5, 1)] * LEAST_RUNS, [(4, 3)]), HOME)
+    for found in own.values():
+        assert (found.unit, found.note) == ("seed", "this checkpoint only") and found.p == 1.0  # one task
+
+
+@pytest.mark.parametrize("test", [diagonal, at_home])
+def test_what_cannot_be_compared_is_told(test: Any) -> None:
+    played = cells([(5, 1)] * 3, [(4, 3)] * 3)
+    with pytest.raises(ValueError, match="b has no run; leave it out"):
+        test({**played, "b": {}}, HOME)
+    with pytest.raises(ValueError, match="needs two scaffolds"):
+        test({"a": played["a"]}, HOME)
 
 
 def test_tasks_that_a_cell_lacks_are_left_out_and_holes_refused() -> None:

@@ -17,7 +17,6 @@ pytest.importorskip("minigrid")
 from agentspec.extends import read_extended
 from agentspec.files import read_lines
 from agentspec.registry import SpecError
-from eval.study import training
 from recipes import grpo_delivery, grpo_memory, learning_study, sft_warmup, supo_delivery
 from recipes.common import CONFIGS
 from tests.tiny import tiny_model, tiny_tokenizer
@@ -101,13 +100,13 @@ def test_two_scaffolds_and_one_update_end_to_end(
     spent = [line["what"] for line in read_lines(out / "costs.jsonl")]
     assert sorted(spent) == ["evaluation", "train none", "train sheet"]
     # Again: nothing is left to train or to play.
-    monkeypatch.setattr(training, "process", None)
+    monkeypatch.setattr(learning_study, "process", None)
     run(monkeypatch, "--config", config)
     assert len(read_lines(out / "episodes.jsonl")) == 14
 
 
 def here(study: Any, what: str, recipe: str, config: str, folder: Path, *more: str) -> None:
-    """In the place of `eval.study.training.process`: the recipe in this process."""
+    """In the place of `learning_study.process`: the recipe in this process."""
     file = Path(study.out) / "configs" / f"{config}.yaml"
     main = sft_warmup.main if recipe == "sft_warmup" else RECIPES[recipe].main
     sys.argv = [recipe, "--config", str(file), "--output_dir", str(folder), *more]
@@ -132,7 +131,7 @@ def test_a_study_killed_after_one_arm_goes_on_where_it_stopped(
         done.append(what)
         here(study, what, *given)
 
-    monkeypatch.setattr(training, "process", dies)
+    monkeypatch.setattr(learning_study, "process", dies)
     with pytest.raises(KeyboardInterrupt):
         run(monkeypatch, "--config", config)
     assert done == ["warm start", "train none"] and not (out / "results.jsonl").exists()
@@ -143,7 +142,7 @@ def test_a_study_killed_after_one_arm_goes_on_where_it_stopped(
         again.append(what)
         here(study, what, *given)
 
-    monkeypatch.setattr(training, "process", notes)
+    monkeypatch.setattr(learning_study, "process", notes)
     run(monkeypatch, "--config", config)
     assert again == ["train sheet"] and (out / "runs" / "none-s0" / "seal.json").read_bytes() == head
     manifest = json.loads((out / "runs" / "sheet-s0" / "manifest.json").read_text())
@@ -183,6 +182,33 @@ def test_the_shipped_studies_are_sound(tmp_path: Path, name: str) -> None:
         # The start has met every scaffold that somebody is trained in, and none that is held out.
         assert {given.scaffolds[arm.scaffold].label for arm in given.arms.values()} <= labels
         assert not any("mad" in label or "openclaw" in label for label in labels)
+
+
+def test_held_out_are_episodes_that_nobody_is_trained_on(tmp_path: Path) -> None:
+    """The study of MiniGrid, whose seeds repeat 196 layouts; and a start that another study has left."""
+    from agentspec.tasks import SPLITS, episode_key, make_tasks
+    from eval.study import read_study
+    from eval.study.playing import held_out
+
+    given = read_study({**read_extended("transfer_minigrid_cpu", CONFIGS), "out": str(tmp_path)})
+    configs = {arm: learning_study.arm_config(given, arm) for arm in given.arms}
+    warm = learning_study.written(given, "warmup", given.warmup, False)
+    [held] = held_out(given.tasks, [*configs.values(), warm]).values()
+    trained = {episode_key(task) for c in (warm, *configs.values()) for task in make_tasks(*c.world, c.train_tasks)}
+    played = {episode_key(task) for task in held}
+    assert len(played) == len(held) == given.tasks == 32 and not played & trained
+    assert all(task.split == "test" and task.seed >= SPLITS["test"] for task in held)
+    by_seed = make_tasks(*warm.world, 32, split="test")  # seeds alone do not keep them apart
+    assert any(episode_key(task) in trained for task in by_seed)
+    # The same start as a folder, from which its manifest tells what it was trained on.
+    told = {"environment": {"name": warm.world[0], "options": warm.world[1]}, "train_tasks": 192, "adapter": ""}
+    (tmp_path / "manifest.json").write_text(json.dumps({"config": told}))
+    for config in configs.values():
+        config.adapter = str(tmp_path)
+    assert held_out(32, [*configs.values()]) == {"minigrid": held}
+    warm.train_tasks = 5000
+    with pytest.raises(SpecError, match=r"got 32 tasks, expected at most 0: minigrid with .*MemoryS13Random"):
+        held_out(32, [*configs.values(), warm])
 
 
 def test_the_paper_s_six_are_evaluated() -> None:

@@ -296,9 +296,29 @@ def test_a_cap_below_1_is_told(tmp_path: Path) -> None:
     assert len(told) == 1 and not list(notes(config(tmp_path, loss_type="cispo", epsilon_high=5.0)))
 
 
+@pytest.mark.parametrize(
+    ("changes", "rounds"),
+    [
+        ({"max_steps": 4}, 4),
+        ({"max_steps": 4, "num_iterations": 2}, 2),
+        ({"max_steps": 5, "num_iterations": 2}, 3),  # the third round gives one step
+        ({"max_steps": 4, "steps_per_generation": 4}, 2),  # two steps of two micro-batches each
+        ({"num_train_epochs": 2.0}, 6),  # 7 tasks, 2 a round: 3 whole rounds a pass
+    ],
+)
+def test_how_many_rounds_a_run_plays(tmp_path: Path, changes: dict[str, Any], rounds: int) -> None:
+    sizes = {"num_generations": 2, "per_device_train_batch_size": 2, "gradient_accumulation_steps": 2}
+    if "steps_per_generation" in changes:
+        sizes["per_device_train_batch_size"] = 1
+    assert config(tmp_path, train_tasks=7, **{**sizes, "max_steps": -1, **changes}).rounds == rounds
+
+
 def test_held_out_tasks_that_are_trained_on_are_told(tmp_path: Path) -> None:
     """Of ten layouts, training tasks 0 to 7 are eight; seeds 20000 to 20009 are all ten."""
     sizes = {"train_tasks": 8, "eval_tasks": 10, "environment": {"name": "minigrid", "options": {"suite": "paper"}}}
     assert [n for n in notes(config(tmp_path, **sizes)) if "8 of 10 tasks of the test split" in n]
-    other = {"name": "minigrid", "options": {"suite": "practice"}}
-    assert not [n for n in notes(config(tmp_path, **{**sizes, "environment": other})) if "split" in n]
+    # Of the layouts of `practice`, Empty has one and another is met again; a level of many layouts repeats none.
+    for options, seen in ({"suite": "practice"}, 2), ({"level": "BabyAI-PutNextS5N1-v0"}, 0):
+        told = list(notes(config(tmp_path, **{**sizes, "environment": {"name": "minigrid", "options": options}})))
+        assert [n for n in told if f"{seen} of 10 tasks of the test split" in n] == told
+        assert len(told) == (seen > 0)

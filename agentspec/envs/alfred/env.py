@@ -88,13 +88,13 @@ class AlfredEnv(Game):
     }
 
     @staticmethod
-    def episodes(options: Mapping[str, Any]) -> int | None:
-        """How many there are under these options: the paper's seven, one `task` or file; of ours one for each seed."""
+    def episode_key(options: Mapping[str, Any], seed: int) -> tuple[str, int, int]:
+        """Name of the episode that a seed starts: the file, or suite, task and trial (of ours every seed is one)."""
         if options.get("trial_file"):
-            return 1
-        if options.get("suite", "own") == "own":
-            return None if options.get("task", -1) < 0 else 1
-        return len(PAPER) if options.get("task", -1) < 0 else 1
+            return str(Path(options["trial_file"]).resolve()), 0, 0
+        suite, number = options.get("suite", "own"), options.get("task", -1)
+        number = seed if number < 0 else number
+        return suite, number if suite == "own" else number % len(PAPER), options.get("trial", 0)
 
     def __init__(
         self,

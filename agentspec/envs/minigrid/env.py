@@ -23,8 +23,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from agentspec.actions import parse_action
-from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum
-from agentspec.envs.minigrid.suites import PAPER, Layout, layout_of
+from agentspec.envs.minigrid.search import ACTIONS, actions_of, optimum, start_of
+from agentspec.envs.minigrid.suites import Layout, layout_of
 from agentspec.envs.minigrid.texts import TEXTS, compact
 from agentspec.envs.minigrid.view import Thing, View, look
 from agentspec.envs.shared import ASCII, check, printable
@@ -119,11 +119,10 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
     }
 
     @staticmethod
-    def episodes(options: Mapping[str, Any]) -> int | None:
-        """How many there are under these options: ten in the suite `paper`, one for a `task`, else one a seed."""
-        if options.get("task"):
-            return 1
-        return None if options.get("level") or (options.get("suite") or "paper") != "paper" else len(PAPER)
+    def episode_key(options: Mapping[str, Any], seed: int) -> str:
+        """Name of the episode that a seed starts: its level and what stands where in the beginning."""
+        layout = layout_of(**_choice(**{name: options.get(name) for name in ("suite", "level", "task")}), seed=seed)
+        return start_of(layout.id, layout.seed)
 
     def __init__(
         self,
@@ -137,15 +136,13 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         images: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        if not (suite or level or task):
-            suite = "paper"
-        layout_of(suite=suite, level=level, task=task)
+        self._choice = _choice(suite, level, task)
+        layout_of(**self._choice)
         check("observation", observation, tuple(TEXTS))
         check("action_mode", action_mode, ("native", "menu"))
         check("render_mode", render_mode, (None, "rgb_array"))
         if max_steps < 1:
             raise ValueError(f"max_steps is {max_steps}; expected at least 1")
-        self._choice = {"suite": suite, "level": level, "task": task}
         self._word = TEXTS[observation]
         self.max_steps = max_steps
         self.images = images
@@ -347,6 +344,12 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         steps = int(self.world.step_count)
         best = layout.optimal if layout.optimal is not None else optimum(layout.id, layout.seed, MOST_STATES)
         return {} if best is None else {"efficiency": best / max(steps, best), "optimal_steps": float(best)}
+
+
+def _choice(suite: str | None, level: str | None, task: str | None) -> dict[str, str]:
+    """What is played, of the three that may be given: the suite `paper` if none is."""
+    given = {"suite": suite or "", "level": level or "", "task": task or ""}
+    return given if any(given.values()) else {**given, "suite": "paper"}
 
 
 def _no_picture() -> dict[str, Any]:

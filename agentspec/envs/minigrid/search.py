@@ -7,6 +7,8 @@ environment is put back by `capture`, which remembers every mutable object in it
 from __future__ import annotations
 
 import functools
+import hashlib
+import json
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -124,6 +126,33 @@ def shortest_plan(world: Any, *, most_states: int = 200_000) -> list[int] | None
         return None
     finally:
         start()
+
+
+@functools.lru_cache(maxsize=65_536)
+def start_of(id: str, seed: int) -> str:
+    """Level, and a digest of what an episode on layout `seed` starts with: equal for seeds that start the same one.
+
+    Grid (what boxes hold included), position, heading and mission. Where obstacles move by chance the seed is a part of
+    it. Takes about half a millisecond.
+    """
+    import minigrid  # noqa: F401  (registers its environments)
+
+    env = gymnasium.make(id, disable_env_checker=True)
+    try:
+        env.reset(seed=seed)
+        world: Any = env.unwrapped
+        cells = [_contents(cell) for cell in world.grid.grid]
+        place = (world.grid.width, *map(int, world.agent_pos), int(world.agent_dir))
+        chance = seed if hasattr(world, "obstacles") else None
+        told = json.dumps((cells, place, str(world.mission), chance))
+    finally:
+        env.close()
+    return f"{id}:{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+
+
+def _contents(cell: Any) -> list[Any] | None:
+    """What stands in a cell, and what that holds: nested lists of MiniGrid's numbers of type, colour and state."""
+    return None if cell is None else [*map(int, cell.encode()), _contents(getattr(cell, "contains", None))]
 
 
 @functools.lru_cache(maxsize=256)

@@ -85,11 +85,12 @@ class RoboThorEnv(Game):
     }
 
     @staticmethod
-    def episodes(options: Mapping[str, Any]) -> int:
-        """How many there are under these options: those of the suite, or one `episode`."""
+    def episode_key(options: Mapping[str, Any], seed: int) -> str:
+        """Name of the episode that a seed starts: of the suite its seed modulo their number, or the one `episode`."""
         if options.get("episode"):
-            return 1
-        return len(OWN if options.get("suite", "own") == "own" else VALIDATION)
+            return str(options["episode"])
+        own = options.get("suite", "own") == "own"
+        return f"own {seed % len(OWN)}" if own else VALIDATION[seed % len(VALIDATION)]
 
     def __init__(
         self,

@@ -191,13 +191,16 @@ def test_what_is_in_a_drawer_is_not_on_the_counter_above():
         ({"suite": "paper"}, 7),
         ({"suite": "paper", "task": 2}, 1),
         ({"trial_file": ""}, None),
+        ({"trial_file": "a.json"}, 1),
     ],
 )
 def test_how_many_episodes_there_are(options, count):
-    assert AlfredEnv.episodes(options) == count
+    assert len({AlfredEnv.episode_key(options, seed) for seed in range(30)}) == (count or 30)
     if "suite" not in options and "trial_file" not in options:
         env = AlfredEnv(**options)
         assert len({env.trial_of(seed).id for seed in range(30)}) == (count or 30)
+    if "suite" in options:
+        assert AlfredEnv.episode_key({**options, "trial": 1}, 2) != AlfredEnv.episode_key(options, 2)
 
 
 def test_the_rules_say_how_each_kind_of_task_is_done() -> None:

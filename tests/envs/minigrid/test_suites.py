@@ -7,10 +7,11 @@ import random
 from pathlib import Path
 
 import pytest
+from minigrid.core.world_object import Box, Key
 
 from agentspec.envs.minigrid.env import CALLS, MiniGridEnv
 from agentspec.envs.minigrid.expert import expert
-from agentspec.envs.minigrid.search import optimum, shortest_plan
+from agentspec.envs.minigrid.search import _contents, optimum, shortest_plan
 from agentspec.envs.minigrid.suites import PAPER, SUITES, layout_of
 
 SHARED = Path(__file__).parents[4] / "shared" / "minigrid_optimal.json"
@@ -114,13 +115,30 @@ def test_the_expert_of_practice_looks_before_it_chooses():
     [
         ({}, 10),
         ({"suite": "paper"}, 10),
-        ({"suite": "memory"}, None),
         ({"task": PAPER[3].name}, 1),
-        ({"level": "MiniGrid-Empty-8x8-v0"}, None),
+        ({"suite": None, "level": "MiniGrid-Empty-8x8-v0"}, 1),
+        ({"level": "MiniGrid-MemoryS7-v0"}, 16),  # two objects x two ends of a hallway x four places: see the level
+        ({"level": "MiniGrid-Dynamic-Obstacles-5x5-v0"}, 200),  # obstacles move by chance, which the seed decides
     ],
 )
-def test_how_many_episodes_there_are(options: dict[str, str], count: int | None) -> None:
-    """What the environment declares is what its seeds do."""
-    assert MiniGridEnv.episodes(options) == count
-    layouts = {layout_of(**(options or {"suite": "paper"}), seed=seed) for seed in range(40)}
-    assert len(layouts) == (count or 40)
+def test_which_episode_a_seed_starts(options: dict[str, str], count: int) -> None:
+    """Names are equal where the first observation, seen from above, is."""
+    assert len({MiniGridEnv.episode_key(options, seed) for seed in range(200)}) == count
+    env = MiniGridEnv(**{name: value or "" for name, value in options.items()})
+    first: dict[str, set[str]] = {}
+    for seed in range(60):
+        env.reset(seed=seed)
+        picture = f"{env.layout.id} {env.world.mission} {env.world.agent_pos} {env.world.pprint_grid()}"
+        first.setdefault(MiniGridEnv.episode_key(options, seed), set()).add(picture)
+    assert all(len(pictures) == 1 for pictures in first.values())
+    if "Dynamic" not in str(options):
+        assert len(set.union(*first.values())) == len(first)
+
+
+def test_what_a_box_holds_and_how_an_episode_is_shown() -> None:
+    """A hidden key is a part of the start; texts and limits are not."""
+    level = {"level": "MiniGrid-ObstructedMaze-1Dlh-v0"}
+    assert MiniGridEnv.episode_key({**level, "observation": "compact", "max_steps": 5}, 7) == MiniGridEnv.episode_key(
+        level, 7
+    )
+    assert _contents(Box("red", Key("blue"))) != _contents(Box("red", Key("green"))) != _contents(Box("red"))

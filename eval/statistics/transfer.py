@@ -13,7 +13,11 @@ learnt altogether. What is left is the diagonal's: 0 if no policy is better at h
   is Student's with Satterthwaite's degrees of freedom. With fewer than `LEAST_RUNS` runs of any arm it is over tasks,
   about these checkpoints only;
 - by permutation: if homes mean nothing, any assignment of homes to the policies is as good as the real one. The p-value
-  is the share of all n! assignments whose diagonal is as far from 0; with three homes it cannot be below 1/6.
+  is the share of all n! assignments whose diagonal is as far from 0. Over all of them the diagonals sum to 0: with two
+  homes the other assignment's is the real one's with the other sign, so nothing can be told (NaN); with three and more
+  the real one can stand alone, and the smallest p-value is 1 / n!.
+
+`at_home` asks another question, per home: does who is trained there do better there than those trained elsewhere?
 """
 
 from __future__ import annotations
@@ -21,18 +25,22 @@ from __future__ import annotations
 import itertools
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from eval.statistics import LEAST_RUNS, LEVEL, RESAMPLES, Estimate, compare_runs, mean_interval, sign_flip
+from eval.statistics.estimates import LEVEL, RESAMPLES, Estimate
+from eval.statistics.runs import weighted_runs
 
 Cells = Mapping[str, Mapping[str, Mapping[str, Mapping[str, float]]]]
 """arm -> training run -> scaffold -> task -> value."""
 
 EXACT_HOMES = 7
 """Up to this many homes all assignments are gone through (5,040); beyond, `RESAMPLES` random ones."""
+
+LEAST_HOMES = 3
+"""With fewer homes no assignment is further from 0 than another."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Diagonal:
 
     Args:
         estimate: with the p-value of the t test (of the sign-flip test, over tasks).
-        permutation: p-value over assignments of homes; NaN with one home.
+        permutation: p-value over assignments of homes; NaN with fewer than `LEAST_HOMES`.
         assignments: how many there are.
     """
 
@@ -49,16 +57,24 @@ class Diagonal:
     permutation: float
     assignments: int
 
+    @property
+    def tried(self) -> int:
+        """How many assignments were gone through, the real one among them."""
+        return self.assignments if self.assignments <= math.factorial(EXACT_HOMES) else 1 + RESAMPLES
+
+    @property
+    def least(self) -> float:
+        """The smallest p-value that the permutation can have."""
+        return math.nan if math.isnan(self.permutation) else 1 / self.tried
+
 
 def contrasts(cells: Cells, home: Mapping[str, str]) -> dict[str, dict[str, dict[str, float]]]:
     """arm -> run -> task -> x(r), on the tasks that all cells of all homes have.
 
     Raises:
-        ValueError: fewer than two homes, or a run that was not played in one of them.
+        ValueError: fewer than two homes, an arm without runs, or a run that was not played in one of them.
     """
-    homes = list(dict.fromkeys(home[arm] for arm in cells))
-    if len(homes) < 2:
-        raise ValueError(f"a diagonal needs two scaffolds that policies were trained in, got {homes}")
+    homes = _homes(cells, home)
     for arm, runs in cells.items():
         if lacking := [(run, s) for run, of in runs.items() for s in homes if not of.get(s)]:
             raise ValueError(f"run {lacking[0][0]} of {arm} has no value in {lacking[0][1]}; evaluate it there")
@@ -74,6 +90,15 @@ def contrasts(cells: Cells, home: Mapping[str, str]) -> dict[str, dict[str, dict
     return found
 
 
+def _homes(cells: Cells, home: Mapping[str, str]) -> list[str]:
+    homes = list(dict.fromkeys(home[arm] for arm in cells))
+    if len(homes) < 2:
+        raise ValueError(f"a diagonal needs two scaffolds that policies were trained in, got {homes}")
+    if empty := [arm for arm, runs in cells.items() if not runs]:
+        raise ValueError(f"{empty[0]} has no run; leave it out, or train it")
+    return homes
+
+
 def diagonal(cells: Cells, home: Mapping[str, str], *, level: float = LEVEL, seed: int = 0) -> Diagonal:
     """Test the diagonal against the rest (see the module's text).
 
@@ -84,54 +109,29 @@ def diagonal(cells: Cells, home: Mapping[str, str], *, level: float = LEVEL, see
         ValueError: as `contrasts`, or no task that all cells have.
     """
     found = contrasts(cells, home)
-    if not all(values for runs in found.values() for values in runs.values()):
-        raise ValueError("no task was completed in every cell")
-    sharing = [home[arm] for arm in found]
-    weight = {arm: 1 / (len(set(sharing)) * sharing.count(home[arm])) for arm in found}
-    means = {arm: [math.fsum(v.values()) / len(v) for v in runs.values()] for arm, runs in found.items()}
-    if min(map(len, means.values())) < LEAST_RUNS:
-        tasks = next(iter(next(iter(found.values())).values()))
-        by_task = [
-            math.fsum(weight[arm] * math.fsum(v[t] for v in runs.values()) / len(runs) for arm, runs in found.items())
-            for t in tasks
-        ]
-        over = mean_interval(by_task, level=level)
-        p = sign_flip(by_task, seed=seed)
-        estimate = Estimate(over.mean, over.low, over.high, over.n, "seed", p, "this checkpoint only")
-    else:
-        estimate = _stratified([(weight[arm], values) for arm, values in means.items()], level)
     tasks = next(iter(next(iter(found.values())).values()))  # those that every cell has
+    if not tasks:
+        raise ValueError("no task was completed in every cell")
+    weight, homes = _shares(found, home), _homes(cells, home)
+    estimate = weighted_runs([(weight[arm], [*runs.values()]) for arm, runs in found.items()], level=level, seed=seed)
     common = {
-        arm: {run: {s: {t: of[s][t] for t in tasks} for s in sharing} for run, of in cells[arm].items()}
-        for arm in found
+        arm: {run: {s: {t: of[s][t] for t in tasks} for s in homes} for run, of in runs.items()}
+        for arm, runs in cells.items()
     }
     return Diagonal(estimate, *_permutation(common, home, seed))
 
 
-def _stratified(samples: Sequence[tuple[float, Sequence[float]]], level: float) -> Estimate:
-    """A weighted sum of the means of independent samples: t interval and test with Satterthwaite's degrees of freedom.
-
-    Where no sample varies beyond float noise there is nothing to test: `p` is 1 for 0, else 0.
-    """
-    from scipy import stats
-
-    mean = math.fsum(w * math.fsum(values) / len(values) for w, values in samples)
-    count = sum(len(values) for _, values in samples)
-    parts = [w**2 * float(np.var(values, ddof=1)) / len(values) for w, values in samples]
-    noise = 1e-12 * max(1.0, *(abs(v) for _, values in samples for v in values))
-    if (error := math.sqrt(math.fsum(parts))) <= noise:
-        return Estimate(mean, mean, mean, count, "run", float(abs(mean) <= noise))
-    freedom = math.fsum(parts) ** 2 / math.fsum(
-        part**2 / (len(values) - 1) for part, (_, values) in zip(parts, samples, strict=True)
-    )
-    half = float(stats.t.ppf((1 + level) / 2, freedom)) * error
-    p = float(2 * stats.t.sf(abs(mean) / error, freedom))
-    return Estimate(mean, mean - half, mean + half, count, "run", p)
+def _shares(arms: Iterable[str], home: Mapping[str, str]) -> dict[str, float]:
+    """Weight of each arm in a mean over homes: homes weigh the same, and so do the arms of one."""
+    sharing = [home[arm] for arm in arms]
+    return {arm: 1 / (len(set(sharing)) * sharing.count(home[arm])) for arm in arms}
 
 
 def _permutation(cells: Cells, home: Mapping[str, str], seed: int) -> tuple[float, int]:
     """p-value of the diagonal among all assignments of homes, and how many of those there are."""
     homes = list(dict.fromkeys(home[arm] for arm in cells))
+    if len(homes) < LEAST_HOMES:
+        return math.nan, math.factorial(len(homes))
     grid = np.zeros((len(homes), len(homes)))
     for i, own in enumerate(homes):
         arms = [arm for arm in cells if home[arm] == own]
@@ -151,19 +151,22 @@ def _permutation(cells: Cells, home: Mapping[str, str], seed: int) -> tuple[floa
     return float(np.mean(np.abs(drawn) >= abs(drawn[0]) - slack)), math.factorial(n)
 
 
-def at_home(cells: Cells, home: Mapping[str, str], *, level: float = LEVEL) -> dict[str, Estimate]:
-    """Per home: runs that were trained there less all runs that were trained elsewhere, both evaluated there.
+def at_home(cells: Cells, home: Mapping[str, str], *, level: float = LEVEL, seed: int = 0) -> dict[str, Estimate]:
+    """Per home: runs that were trained there less those that were trained elsewhere, both evaluated there.
 
     What a user who deploys in that scaffold gains by training in it, whatever the reason: how well an arm has learnt
-    altogether is in it too.
+    altogether is in it too. Every arm is a sample of its own, also where it is the only one of its side: a single run
+    is a draw of its recipe and no fixed policy, so with fewer than `LEAST_RUNS` runs of any arm this is over tasks.
+
+    Raises:
+        ValueError: fewer than two homes, or an arm without runs.
     """
     found = {}
-    for own in dict.fromkeys(home[arm] for arm in cells):
-        here, away = (
-            [of[own] for arm, runs in cells.items() if (home[arm] == own) == mine for of in runs.values()]
-            for mine in (True, False)
-        )
-        found[own] = compare_runs(here, away, level=level)
+    for own in _homes(cells, home):
+        here, away = ([arm for arm in cells if (home[arm] == own) == mine] for mine in (True, False))
+        signed = {**_shares(here, home), **{arm: -share for arm, share in _shares(away, home).items()}}
+        samples = [(weight, [of[own] for of in cells[arm].values()]) for arm, weight in signed.items()]
+        found[own] = weighted_runs(samples, level=level, seed=seed)
     return found
 
 
