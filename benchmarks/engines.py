@@ -38,6 +38,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol
 
+from agentspec.cli.errors import expected_errors
+from agentspec.llm.base import LLMError
 from agentspec.tokens import shared_prefix
 from benchmarks.rollouts import FixedLengthLLM, agent_spec, load_model, tiny
 
@@ -74,16 +76,24 @@ class Ours:
     def __init__(self, model: Any, tokenizer: Any) -> None:
         self.llm = FixedLengthLLM(model.eval(), tokenizer, 1)
         self.salt: int | None = None
-        ends, packed, chat = sorted(self.llm.stop_ids), self.llm._engine.model, self.llm.chat
-        forward, render = packed.forward, chat.render
+        engine, chat, ends = self.llm._engine, self.llm.chat, sorted(self.llm.stop_ids)
+        packed, advance, render = engine.model, engine._advance, chat.render
+        forward = packed.forward
 
-        def unending(segments: Any) -> Any:
+        def masked(segments: Any) -> Any:
             outputs = forward(segments)
             for logits in outputs:
                 logits[:, ends] = float("-inf")
             return outputs
 
-        packed.forward = unending  # type: ignore[method-assign]
+        def unending(step: Any) -> None:  # only here: the model is also asked whether it computes correctly
+            packed.forward = masked  # type: ignore[method-assign]
+            try:
+                advance(step)
+            finally:
+                packed.forward = forward  # type: ignore[method-assign]
+
+        engine._advance = unending  # type: ignore[method-assign]
         chat.render = lambda messages: [self.salt, *render(messages)]  # type: ignore[method-assign]
 
     def fresh(self) -> None:
@@ -110,7 +120,7 @@ class Server:
         try:
             self._model = str(self._httpx.get(f"{self._url}/v1/models", timeout=10).json()["data"][0]["id"])
         except (self._httpx.HTTPError, ValueError, LookupError, TypeError) as error:
-            raise SystemExit(f"{url}/v1/models names no model ({error!r}); start the server or mend --server") from None
+            raise LLMError(f"{url}/v1/models names no model ({error!r}); start the server or mend --server") from None
 
     def fresh(self) -> None:
         """A connection for every episode."""
@@ -130,11 +140,17 @@ class Server:
         } | ({"logprobs": 1} if self._logprobs else {})
         response = await self._client.post(f"{self._url}/v1/completions", json=body)
         if response.status_code != 200:
-            raise SystemExit(f"{self._url}: status {response.status_code}: {response.text[:300]}")
+            raise LLMError(
+                f"{self._url}: status {response.status_code}: {response.text[:300]}; the server has to take token ids "
+                "as a prompt, and its context must hold the last turn (see `--turns`)"
+            )
         answer = response.json()
         written = answer["usage"]["completion_tokens"]
         if written != tokens:
-            raise SystemExit(f"{self._url} wrote {written} tokens where {tokens} were asked for")
+            raise LLMError(
+                f"{self._url} wrote {written} tokens where {tokens} were asked for: it knows neither `ignore_eos` nor "
+                "`min_tokens`, or its context is full"
+            )
         return str(answer["choices"][0]["text"])
 
 
@@ -226,7 +242,7 @@ def servers(given: Sequence[str], logprobs: bool) -> dict[str, Engine]:
     for text in given:
         name, separator, url = text.partition("=")
         if not separator or not url.startswith("http") or name in found or name == OURS:
-            raise SystemExit(f"--server {text!r}: expected NAME=URL, names that differ (and from {OURS!r}), http://...")
+            raise LLMError(f"--server {text!r}: expected NAME=URL, names that differ (and from {OURS!r}), http://...")
         found[name] = Server(url, logprobs)
     return found
 
@@ -265,4 +281,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with expected_errors():
+        main()

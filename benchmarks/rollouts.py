@@ -81,9 +81,7 @@ def market_tasks(rollouts: int, options: dict[str, Any]) -> list[tuple[Any, int]
 def our_rollouts(
     model: Any, tokenizer: Any, rollouts: int, options: dict[str, Any], answer: int
 ) -> tuple[Callable[[], tuple[float, int]], Phases]:
-    """A function that plays all episodes from an empty cache: seconds, and tokens of all conversations; what they took
-    of prefill and decode.
-    """
+    """A function that plays all episodes from an empty cache (seconds, tokens of all conversations), and its phases."""
     from agentspec.episode import Job, Runner
 
     llm = FixedLengthLLM(model, tokenizer, answer)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,8 +22,13 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from agentspec.llm.base import LLMError
+from agentspec.llm.local.cache import Slot
 from agentspec.llm.local.forward import Segment
+from agentspec.llm.local.rows import Job
+from agentspec.types import Sampling
 from benchmarks import engines
+from benchmarks.gradient_error import differences, errors, gradients, in_float64
 from benchmarks.measuring import Ceilings, ceilings
 from benchmarks.phases import Phases, Work
 from benchmarks.rollouts import FixedLengthLLM, tiny
@@ -32,7 +38,7 @@ WORLD = {"steps": 3, "words": 4}
 
 
 class Loopback:
-    """A server with OpenAI's completions, an engine of our own behind it; `answer` may change what it says."""
+    """A server with OpenAI's completions, an engine of our own behind it."""
 
     def __init__(self) -> None:
         self.engine = engines.Ours(*tiny())
@@ -50,9 +56,10 @@ class Loopback:
                 body = json.loads(self.rfile.read(int(self.headers["content-length"])))
                 with outer._lock:
                     outer.bodies.append(body)
-                    text = asyncio.run(outer.engine.complete("", body["prompt"], body["max_tokens"]))
+                    job = Job("", body["prompt"], Sampling(temperature=0.0, max_tokens=body["max_tokens"]))
+                    outer.engine.llm._engine.run([job])
                 usage = {"completion_tokens": body["max_tokens"] - outer.missing}
-                self._send(outer.status, {"choices": [{"text": text}], "usage": usage})
+                self._send(outer.status, {"choices": [{"text": job.completions[0].text}], "usage": usage})
 
             def _send(self, status: int, content: Any) -> None:
                 data = json.dumps(content).encode()
@@ -130,14 +137,14 @@ def test_what_servers_may_get_wrong(loopback: Loopback) -> None:
     asyncio.run(engines.replay(server, turns))
     assert loopback.bodies[-1]["logprobs"] == 1
     loopback.missing = 1
-    with pytest.raises(SystemExit, match="wrote 1 tokens where 2"):
+    with pytest.raises(LLMError, match="wrote 1 tokens where 2"):
         asyncio.run(engines.replay(server, turns))
     loopback.status = 500
-    with pytest.raises(SystemExit, match="status 500"):
+    with pytest.raises(LLMError, match="status 500"):
         asyncio.run(engines.replay(server, turns))
-    with pytest.raises(SystemExit, match="start the server"):
+    with pytest.raises(LLMError, match="start the server"):
         engines.servers(["b=http://127.0.0.1:9"], logprobs=False)
-    with pytest.raises(SystemExit, match="expected NAME=URL"):
+    with pytest.raises(LLMError, match="expected NAME=URL"):
         engines.servers(["nonsense"], logprobs=False)
 
 
@@ -148,7 +155,6 @@ def test_work_is_what_a_forward_multiplies() -> None:
     model = llm._engine.model
     work = Work.of(model.model)
     assert work.size == 4 * (work.every + work.wanted)
-    from agentspec.llm.local.cache import Slot
 
     def packed(x: Any, *_: Any, out_shape: Any, **__: Any) -> int:
         return int(2 * torch.Size(out_shape).numel() * x[-1])
@@ -164,9 +170,6 @@ def test_work_is_what_a_forward_multiplies() -> None:
 def test_phases_tell_reading_from_writing() -> None:
     llm = FixedLengthLLM(*(m.eval() if hasattr(m, "eval") else m for m in tiny()), 4)
     phases = Phases(llm)
-    from agentspec.llm.local.rows import Job
-    from agentspec.types import Sampling
-
     jobs = [Job(str(i), [200 + i, *range(20)], Sampling(max_tokens=5)) for i in range(3)]
     llm._engine.run(jobs)
     at = Ceilings(flops=1e12, copied=1e12, read=1e3)  # reading weights decides
@@ -181,6 +184,37 @@ def test_phases_tell_reading_from_writing() -> None:
     )
     phases.clear()
     assert phases.summary(at)["prefill"]["tokens"] == 0
+
+
+def test_gradients_are_compared_by_norm_and_beside_float64() -> None:
+    a = {"w": torch.tensor([3.0, 4.0]), "v": torch.tensor([0.3, 0.0])}
+    b = {"w": torch.tensor([3.0, 4.0]), "v": torch.tensor([0.0, 0.3])}
+    found = differences(b, a)
+    assert found["max_rel_grad_diff"] == pytest.approx(2**0.5)
+    whole = (25 + 0.09) ** 0.5
+    assert found["max_rel_grad_diff_at"] == {"parameter": "v", "share_of_gradient": pytest.approx(0.3 / whole)}
+    assert found["rel_grad_diff"] == pytest.approx(0.3 * 2**0.5 / whole)
+    tokenizer = tiny_tokenizer()
+    trainer = SimpleNamespace(model=tiny_model(tokenizer))
+    before = {n: p.clone() for n, p in trainer.model.named_parameters()}
+    ids = torch.arange(40)[None]
+
+    def update() -> None:
+        trainer.model(input_ids=ids, labels=ids).loss.backward()
+
+    update()
+    single = gradients(trainer)
+    exact = in_float64(trainer, update)
+    assert {g.dtype for g in exact.values()} == {torch.float64} and {g.dtype for g in single.values()} == {
+        torch.float32
+    }
+    apart = errors({"ours": single}, exact)
+    assert 0 < apart["ours_error"] < 1e-5 and apart["ours_error"] <= apart["ours_max_error"]
+    # Afterwards the model is, bit for bit, what it was.
+    assert all(torch.equal(p, before[n]) for n, p in trainer.model.named_parameters())
+    update()
+    again = gradients(trainer)
+    assert all(torch.equal(again[n], g) for n, g in single.items())
 
 
 def test_ceilings_are_positive() -> None:
