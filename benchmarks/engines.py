@@ -231,11 +231,6 @@ def measure(engines: dict[str, Engine], ours: Ours, options: argparse.Namespace)
     return {"engines": result, "prompt_tokens": tokens}
 
 
-def warm_up(engine: Engine, salt: int) -> None:
-    """What an engine does once: compiling, allocating, checking its own arithmetic."""
-    asyncio.run(replay(engine, [[Turn((salt, *range(100, 164)), (0, 0))]]))
-
-
 def servers(given: Sequence[str], logprobs: bool) -> dict[str, Engine]:
     """`NAME=URL` -> engine by name."""
     found: dict[str, Engine] = {}
@@ -265,8 +260,9 @@ def main() -> None:
     others = servers(options.server, options.logprobs)
     ours = Ours(*(tiny() if options.model == "tiny" else load_model(options.model)))
     engines: dict[str, Engine] = {OURS: ours, **others}
-    for engine in engines.values():
-        warm_up(engine, FIRST_SALT - 1)
+    once = record(ours, {"steps": 1, "words": options.words}, 1, 2, FIRST_SALT - 1)
+    for engine in engines.values():  # what each does once: compiling, allocating, checking its own arithmetic
+        asyncio.run(replay(engine, once))
     result = measure(engines, ours, options)
     if options.json:
         print(json.dumps({"episodes": options.rollouts, "turns": options.turns, "answer": options.answer} | result))
