@@ -21,8 +21,10 @@ A server is anything with OpenAI's `/v1/completions` that takes token ids as a p
 for the bundled model in float32 on two cores (`FOLDER`: `agentspec.llm.models.resolve`; the GGUF file:
 `python -m benchmarks.gguf_float32`):
 
-    llama-server -m smollm2-135m-f32.gguf -t 2 -np 8 -c 32768 -ctk f32 -ctv f32 --port 8080
+    llama-server -m smollm2-135m-f32.gguf -t 2 -np 8 -c 32768 -ctk f32 -ctv f32 -fa off --port 8080
     VLLM_CPU_KVCACHE_SPACE=4 vllm serve FOLDER --dtype float32 --max-model-len 4096 --port 8000
+
+Without `-fa off`, llama.cpp's log-probabilities on a CPU are off by some 1e-3, whatever its weights are.
 """
 
 from __future__ import annotations
