@@ -43,7 +43,13 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import AgentInput, LLMCall, Recall, Task
 from benchmarks.memory_cost_table import BASELINE, markdown, paper_ratios
 
-OPTIONS: dict[str, Any] = {"size": "tiny", "city_seed": 0, "shift_hours": 1.0, "observation": "compact"}
+OPTIONS: dict[str, Any] = {
+    "size": "tiny",
+    "city_seed": 0,
+    "shift_hours": 1.0,
+    "observation": "compact",
+    "action_mode": "menu",  # in its own words SmolLM2 asks 13 times for an action that can be read
+}
 PROBLEMS = tuple(f"memory/problems/{problem}" for problem in ("malformed", "truncated", "overflow", "budget"))
 DEFAULTS: dict[str, Any] = {"steps": 20, "preset": "rl", "model": "smollm2-135m", "dtype": ""}
 TABLE = "memory.md"

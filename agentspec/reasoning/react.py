@@ -118,11 +118,13 @@ class ReAct:
                 or reading.action.code in ("TRUNCATED", "PARSE_AMBIGUOUS")
                 or not visible(call.text)[0]  # nothing is no thought
             )
-            if meant and retries and not schema.choices:
+            if meant and not schema.choices:
                 assert isinstance(reading.action, ActionError)
                 self.services.count("truncated" if reading.action.code == "TRUNCATED" else "malformed")
-                retries -= 1
+                if not retries:
+                    return self._decision(Acted(reading, call, tuple(calls)), words)
                 reply = complaint(reading.action, schema)
+                retries -= 1
             else:
                 thoughts += 1
                 if thoughts == allowed:

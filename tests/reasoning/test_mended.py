@@ -238,6 +238,14 @@ def test_react_shows_every_step_once() -> None:
     assert prompt.index("Transcript") < prompt.index("The number is")
 
 
+def test_react_asks_again_as_often_as_it_says() -> None:
+    """An action that cannot be read is no thought, also when there are no more retries."""
+    agent = {"reasoning": {"name": "react", "max_retries": 2}}
+    trajectory, _ = play(lambda r: "Thought: there is more.\nAction: SUB(3, 4, 5x)", agent, steps=1)
+    assert [c.tag.purpose for c in trajectory.calls] == ["act"] * 3
+    assert not trajectory.transitions[0].decision.valid
+
+
 def test_react_does_not_take_a_bare_call_for_a_thought() -> None:
     trajectory, requests = play(lambda r: "SUB()", {"reasoning": "react"}, steps=2)
     assert purposes(requests) == ["act", "act"] and not solved(trajectory)
