@@ -24,7 +24,7 @@ for the bundled model in float32 on two cores (`FOLDER`: `agentspec.llm.models.r
     llama-server -m smollm2-135m-f32.gguf -t 2 -np 8 -c 32768 -ctk f32 -ctv f32 -fa off --port 8080
     VLLM_CPU_KVCACHE_SPACE=4 vllm serve FOLDER --dtype float32 --max-model-len 4096 --port 8000
 
-Without `-fa off`, llama.cpp's log-probabilities on a CPU are off by some 1e-3, whatever its weights are.
+Without `-fa off`, llama.cpp's log-probabilities were off by up to 2.5e-3 on a CPU in float32, with it by 1.7e-4.
 """
 
 from __future__ import annotations
