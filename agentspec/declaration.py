@@ -41,11 +41,15 @@ class Purpose:
 
     Args:
         occasion: when it is made.
-        example: a well-formed answer, `""` if any text is one. The contract tests answer with it.
+        example: a well-formed answer, `""` if any text is one. The contract tests answer with it, and a scripted expert
+            with its form: texts of several words are replaced by what the expert notes, single words and numbers stay
+            (`agentspec.reworded`); so let single words be good ones in any world.
+        literal: the example is as good an answer in any world, word for word (a query).
     """
 
     occasion: Occasion
     example: str = ""
+    literal: bool = False
 
     @classmethod
     def each(cls, occasion: Occasion, *names: str) -> dict[str, Purpose]:

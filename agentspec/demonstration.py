@@ -3,8 +3,8 @@
 The environment's expert plays the tasks alone; then the scaffold plays them again with the expert's actions as answers
 (`agentspec.llm.demonstration`). The environment is deterministic, so both passes agree, and the second writes the
 scaffold's prompts. What a scaffold asks besides actions is answered too (`Words`): a thought names the action that
-follows, and what a memory writes are the environment's notes on what was seen so far. An environment names them in the
-class attribute `expert_notes`:
+follows, and what a memory writes are the environment's notes on what was seen so far, in the form of the example that
+the memory declares for the call. An environment names its notes in the class attribute `expert_notes`:
 
     class MyWorld(gymnasium.Env):
         expert_notes = "my_package.my_world.notes:notes"
@@ -15,17 +15,18 @@ matters most first. Where an environment names none, the newest observation is w
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import Any
 
+from agentspec.declaration import Purpose
 from agentspec.envs.making import environment_class
 from agentspec.episode import Job, MakeEnv, Runner, make_env
+from agentspec.importing import import_name
 from agentspec.llm.base import LLMError, Request
 from agentspec.llm.demonstration import DemonstrationLLM
-from agentspec.registry import SpecError
+from agentspec.registry import REGISTRY, SpecError
+from agentspec.reworded import reworded
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.tokens import CountTokens, clip_text
 from agentspec.trajectory import Trajectory
@@ -51,7 +52,8 @@ def play_expert(
     played = Runner(scripted, make_env=make_env).run(jobs)
     actions = {episode.episode: [t.action_text for t in episode.transitions] for episode in played}
     llm = DemonstrationLLM(tokenizer, actions)
-    llm.write = Words({episode.episode: episode for episode in played}, llm.count_tokens)
+    purposes = REGISTRY.get("memory", spec.memory.name).purposes
+    llm.write = Words({episode.episode: episode for episode in played}, llm.count_tokens, purposes)
     episodes = Runner(spec, llm, make_env=make_env).run(jobs)
     failed = [t.error for t in (*played, *episodes) if not t.scorable]
     if failed:
@@ -63,13 +65,15 @@ def notes_of(task: Task, inputs: Sequence[AgentInput]) -> list[str]:
     """What the environment's expert would note of what was seen, what matters most first."""
     declared = getattr(environment_class(task.env), "expert_notes", "")
     if declared:
-        module, _, name = declared.partition(":")
-        notes: Callable[[Sequence[AgentInput]], list[str]] = getattr(import_module(module), name)
+        notes: Callable[[Sequence[AgentInput]], list[str]] = import_name(declared)
         return notes(inputs)
     return [f"Seen last: {' '.join(inputs[-1].text.split())}"] if inputs else []
 
 
 # -- what a scaffold asks besides actions --------------------------------------------------------------------------
+
+THOUGHTS = ("think", "argue")
+"""Purposes of a reasoner's calls that lead to the action, in any words."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +82,12 @@ class Words:
 
     Args:
         episodes: id -> the episode as the expert played it alone.
+        purposes: what the memory's calls are for: an answer has the form of the declared example (`reworded`).
     """
 
     episodes: Mapping[str, Trajectory]
     count_tokens: CountTokens
+    purposes: Mapping[str, Purpose]
 
     def __call__(self, request: Request) -> str:
         """The answer, within the tokens that the request allows.
@@ -90,69 +96,27 @@ class Words:
             LLMError: nobody says how the expert answers this kind of call.
         """
         tag = request.tag
-        form = FORMS.get(tag.purpose)
-        if form is None or tag.episode not in self.episodes:
+        remembers = tag.module.startswith("memory.") and tag.purpose in self.purposes
+        if tag.episode not in self.episodes or not (remembers or tag.purpose in THOUGHTS):
             raise LLMError(
-                f"no demonstration for {tag.path} at step {tag.step} of episode {tag.episode}: the expert acts, and "
-                f"answers calls for {', '.join(FORMS)}; leave this scaffold out"
+                f"no demonstration for {tag.path} at step {tag.step} of episode {tag.episode}: the expert acts, "
+                "thinks aloud, and answers what the memory declares; leave this scaffold out"
             )
         played = self.episodes[tag.episode]
         seen = [t.input for t in played.transitions[: tag.step + 1]]
         ahead = [f"Next: {t.action_text}." for t in played.transitions[tag.step : tag.step + 1]]
         room = request.sampling.max_tokens - 1  # the end of the turn is a token too
-        if form is thought:
-            return clip_text(thought(ahead, request), room, self.count_tokens)
+        if not remembers:
+            return clip_text(ahead[0] if ahead else "Done.", room, self.count_tokens)
+        purpose, asked = self.purposes[tag.purpose], request.messages[-1].text
+        if purpose.literal:
+            return purpose.example
+        example = purpose.example
         notes = [*notes_of(played.task, seen)[: MOST - 1], *ahead]
         for most in range(len(notes), 0, -1):
-            text = form(notes[:most], request)
+            text = reworded(example, notes[:most], asked)
             if self.count_tokens(text) <= room:
                 return text
-        text = form(notes[:1], request)
-        return form([], request) if text.startswith("{") else clip_text(text, room, self.count_tokens)
-
-
-def thought(notes: Sequence[str], request: Request) -> str:
-    """The action that follows, in words."""
-    return notes[-1] if notes else "Done."
-
-
-def sentences(notes: Sequence[str], request: Request) -> str:
-    """Notes as a text."""
-    return " ".join(notes) or "Nothing yet."
-
-
-def sheet(notes: Sequence[str], request: Request) -> str:
-    """Notes as a list, between tags where the request asks for them."""
-    lines = "\n".join(f"- {note}" for note in notes) or "- Nothing yet."
-    tagged = "<cheatsheet>" in request.messages[-1].text
-    return f"<cheatsheet>\n{lines}\n</cheatsheet>" if tagged else lines
-
-
-def insights(notes: Sequence[str], request: Request) -> str:
-    """Notes as the JSON that a memory of insights reads."""
-    return json.dumps({"insights": list(notes[:2]), "avoid": [], "next": list(notes[2:])[-1:]})
-
-
-def edits(notes: Sequence[str], request: Request) -> str:
-    """Notes as rules that are written under the same names each time."""
-    return json.dumps({"edits": [{"op": "add", "name": f"note {i}", "text": n} for i, n in enumerate(notes[:3], 1)]})
-
-
-def rules(notes: Sequence[str], request: Request) -> str:
-    """Notes as all rules there are."""
-    return json.dumps({"rules": [{"name": f"note {i}", "text": n} for i, n in enumerate(notes, 1)]})
-
-
-FORMS: Mapping[str, Callable[[Sequence[str], Request], str]] = {
-    "think": thought,
-    "argue": thought,
-    "summary": sentences,
-    "overview": sentences,
-    "curate": sheet,
-    "synthesise": sheet,
-    "insight": insights,
-    "learn": edits,
-    "flush": sheet,
-    "dream": rules,
-}
-"""Purpose of a call -> how the expert answers it."""
+        text = reworded(example, notes[:1], asked)
+        cannot_be_cut = text.startswith(("{", "["))
+        return reworded(example, [], asked) if cannot_be_cut else clip_text(text, room, self.count_tokens)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from agentspec.importing import import_module
+from agentspec.importing import import_name
 from agentspec.types import ActionError, Transition
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ def signs(trajectory: Trajectory) -> list[Sign]:
     found = [*_unreadable(trajectory.transitions), *_repeated_errors(trajectory.transitions)]
     own = getattr(environment_class(trajectory.task.env), "failure_signs", "")
     if own:
-        module, _, name = own.partition(":")
-        found += getattr(import_module(module), name)(trajectory)
+        found += import_name(own)(trajectory)
     return sorted(found, key=lambda sign: sign.step)
 
 

@@ -7,6 +7,9 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+from agentspec.literals import suggest
 
 
 class SpecError(ValueError):
@@ -37,6 +40,29 @@ def import_module(name: str) -> ModuleType:
                 f"no module {name!r} to import; give a module that Python finds from here, or the path of a .py file"
             ) from error
         raise SpecError(f"importing {name!r} failed: {type(error).__name__}: {error}") from error
+
+
+def import_name(target: str, what: str = "") -> Any:
+    """What `package.module:name` (or `file.py:name`) names.
+
+    Args:
+        target: the name. The working directory counts, after everything that is installed.
+        what: what it is for, to begin messages with ("reward").
+
+    Raises:
+        SpecError: no such form, no such module, nothing of that name in it, or an import that fails.
+    """
+    module, colon, name = target.rpartition(":")
+    if not (module and colon and name):
+        raise SpecError(f"{what} {target!r}: expected package.module:name".strip())
+    try:
+        found = import_module(module)
+    except SpecError as error:
+        raise SpecError(f"{what} {target!r}: {error}".strip()) from error
+    if not hasattr(found, name):
+        near = suggest(name, [n for n, v in vars(found).items() if getattr(v, "__module__", "") == found.__name__])
+        raise SpecError(f"{what} {target!r}: there is no {name!r} in the module {module!r}{near}".strip())
+    return getattr(found, name)
 
 
 def _import_file(path: Path) -> ModuleType:

@@ -90,12 +90,12 @@ def _untold(recall: Recall, services: Services, observation: str) -> Recall:
     told = {
         i
         for i in steps[-context.told :]
-        if recall.items[i].kind == "step" or any(_reason(recall.items[i].text) in text for text in said)
+        if recall.items[i].kind == "step" or any(failure_reason(recall.items[i].text) in text for text in said)
     }
     return Recall(tuple(item for i, item in enumerate(recall.items) if i not in told))
 
 
-def _reason(line: str) -> str:
+def failure_reason(line: str) -> str:
     """Why a step failed, from the line that tells it: `3. JUMP() -> there is no such action`."""
     return line.partition(" -> ")[2].partition("\n")[0]
 

@@ -19,7 +19,6 @@ import importlib
 import inspect
 import pkgutil
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -28,7 +27,7 @@ from typing import Any, Literal
 
 from agentspec.actions import suggest
 from agentspec.declaration import CallProfile, Declaration, Purpose
-from agentspec.importing import SpecError, import_module
+from agentspec.importing import SpecError, import_module, import_name
 
 __all__ = ["REGISTRY", "CallProfile", "Declaration", "Entry", "Purpose", "Registry", "SpecError", "import_modules"]
 
@@ -96,8 +95,7 @@ class Entry:
 
     def load(self) -> Any:
         """Import the target."""
-        module, _, name = self.target.partition(":")
-        return getattr(importlib.import_module(module), name)
+        return import_name(self.target)
 
     def describe(self) -> dict[str, Any]:
         """JSON of the entry, as `agentspec list --json` prints it."""
@@ -295,16 +293,13 @@ def _declared(module: ModuleType) -> Iterator[Any]:
 
 def _from_path(kind: str, name: str) -> Entry:
     """The entry of `package.module:Class`."""
-    module, _, attribute = name.partition(":")
-    cls = getattr(import_module(module), attribute, None)
+    cls = import_name(name, kind)
     if not inspect.isclass(cls):
-        classes = [v for v in vars(sys.modules[module]).values() if inspect.isclass(v)]
-        names = [c.__name__ for c in classes if c.__module__ == module]
-        raise SpecError(f"{kind} {name!r}: module {module!r} has no class {attribute!r}{suggest(attribute, names)}")
+        raise SpecError(f"{kind} {name!r} is no class, but a {type(cls).__name__}; name one: package.module:Class")
     if kind_of(cls) != kind:
         raise SpecError(f"{name} is a {kind_of(cls)} module; the spec names it as {kind}")
     declaration = getattr(cls, "declaration", Declaration())
-    return Entry(name, declaration, declaration.name or snake_case(attribute))
+    return Entry(name, declaration, declaration.name or snake_case(name.rpartition(":")[2]))
 
 
 def _entry_points(kind: str) -> list[metadata.EntryPoint]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from agentspec.llm.base import ContextOverflowError, Message, assistant, user
@@ -40,7 +40,8 @@ class Answer(Generic[T]):
     Args:
         value: the parsed answer, or its text where nothing parses it; `None` if there is none that can be used.
         call: the newest call that was made for it; `None` if none could be made.
-        problem: see `Problem`; empty if all is well. A text that was cut off has both a value and a problem.
+        problem: see `Problem`; empty if all is well. A text that was cut off has both a value and a problem, and so has
+            an answer of which some items were left out.
     """
 
     value: T | None
@@ -148,7 +149,9 @@ class Services:
             sampling: other sampling fields, `temperature` for one.
 
         Returns:
-            Always an answer; it has a `problem` where something was wrong, and the problem is counted.
+            Always an answer; it has a `problem` where something was wrong, and the problem is counted. Where `parse`
+            can salvage, what fits of an answer is its value, after the repair if there is one; the answer counts as
+            `malformed`, and each item that was left out as `rejected`.
         """
         prompt = (user(messages),) if isinstance(messages, str) else tuple(messages)
         sampling = {"stop": (), "choices": (), **sampling, "max_tokens": max_tokens}
@@ -162,10 +165,28 @@ class Services:
             again = (*prompt, assistant(written), user(request))
             repaired = await self._ask_once(purpose, again, sampling | {"branch": "repair"}, parse, credit)
             self.count("repaired" if repaired.value is not None else "unrepaired")
-            answer = repaired if repaired.call else answer
+            answer = self._better(parse, repaired, answer) if repaired.call else answer
+        answer = self._salvaged(parse, answer)
         if answer.problem:
             self.count(answer.problem)
         return answer
+
+    @staticmethod
+    def _better(parse: Any, repaired: Answer[Any], first: Answer[Any]) -> Answer[Any]:
+        """The repaired answer, unless only the first one can be used in part."""
+        if repaired.value is None and _salvage(parse, repaired.text) is None and _salvage(parse, first.text):
+            return first
+        return repaired
+
+    def _salvaged(self, parse: Any, answer: Answer[Any]) -> Answer[Any]:
+        """What fits of an answer that does not fit as a whole; what was left out is counted."""
+        found = _salvage(parse, answer.text) if answer.value is None and answer.call else None
+        if found is None:
+            return answer
+        value, dropped = found
+        for _ in range(dropped):
+            self.count("rejected")
+        return replace(answer, value=value)
 
     def count(self, problem: str) -> None:
         """Count something that went wrong, into the trajectory's metrics as `<kind>/problems/<problem>`."""
@@ -200,3 +221,13 @@ class Services:
         except Exception:
             pass
         return "it is not what was asked for"
+
+
+def _salvage(parse: Any, text: str) -> tuple[Any, int] | None:
+    """What of an answer can be used, and how many of its items cannot; `None` if nothing can."""
+    if not isinstance(parse, Parser) or parse.salvage is None:
+        return None
+    try:
+        return parse.salvage(text)
+    except Exception:  # as with any reader, the text is to blame
+        return None

@@ -6,10 +6,15 @@ schema is the answer. Nothing is converted silently except whole numbers where a
 
     parse = json_of({"keep": bool, "notes": list[str]})
     parse('Sure. ```json\\n{"keep": true, "notes": ["a"]}\\n```')   # {'keep': True, 'notes': ['a']}
+
+An answer that is a list of operations need not be right as a whole: with `whole=False` the items of its lists that fit
+are read where others do not (`Parser.salvage`). Lists in which the place counts, or of which one item makes sense only
+with all others, are read whole.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import re
@@ -26,6 +31,7 @@ _STARTS = re.compile(r"[\[{]")
 _MOST_STARTS = 64  # values tried in one text; a longer search only serves texts that are no answer
 HUGE = 1e300
 """Numbers from here on are no answer to any question."""
+THE_ANSWER = "the answer"
 
 _NAMES = {str: "string", int: "whole number", float: "number", bool: "true or false", dict: "object", list: "list"}
 
@@ -42,17 +48,20 @@ class Parser(Generic[T]):
         read: text -> value; raises `ParseError`.
         expected: what a good answer looks like, for the request to repair a bad one.
         repairs: further calls that may be made for an answer that cannot be read: 0 or 1.
+        salvage: text that `read` refuses -> what of it can be used, and how many items were left out; raises
+            `ParseError`. `None`: an answer is read whole or not at all.
     """
 
     read: Callable[[str], T]
     expected: str
     repairs: int = 1
+    salvage: Callable[[str], tuple[T, int]] | None = None
 
     def __call__(self, text: str) -> T:
         return self.read(text)
 
 
-def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
+def json_of(schema: Any, *, repairs: int = 1, whole: bool = True) -> Parser[Any]:
     """A parser of JSON answers.
 
     Args:
@@ -61,6 +70,8 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
             `X | None`, `Any`, dataclasses and mappings, nested as deep as wanted. Fields that the schema does not
             have are ignored; a dataclass's defaults fill in fields that are missing.
         repairs: see `Parser`.
+        whole: whether one item that does not fit voids the answer; `False` only for a dataclass or mapping whose lists
+            hold items that are of use without each other.
     """
 
     def read(text: str) -> Any:
@@ -75,7 +86,41 @@ def json_of(schema: Any, *, repairs: int = 1) -> Parser[Any]:
                 problem = "it is nested too deeply"
         raise ParseError(problem)
 
-    return Parser(read, f"JSON of the form {describe(schema)}", repairs)
+    def salvage(text: str) -> tuple[Any, int]:
+        for raw in _values(visible(text)[0]):
+            with contextlib.suppress(ParseError, RecursionError):
+                return _what_fits(_replace_surrogates(raw) if "\\u" in text else raw, schema)
+        raise ParseError("nothing of it can be used")
+
+    return Parser(read, f"JSON of the form {describe(schema)}", repairs, None if whole else salvage)
+
+
+def _what_fits(raw: Any, schema: Any) -> tuple[Any, int]:
+    """The answer without the items of its lists that do not fit, and how many these are.
+
+    Raises:
+        ParseError: something else does not fit, or no item is left of an answer that is nothing but lists.
+    """
+    kinds = get_type_hints(schema) if dataclasses.is_dataclass(schema) else dict(schema)
+    given = raw if isinstance(raw, dict) else {}
+    lists = {
+        name: get_args(kind)[0]
+        for name, kind in kinds.items()
+        if get_origin(kind) in (list, tuple) and isinstance(given.get(name), list)
+    }
+    kept = {name: [item for item in given[name] if _fits(item, kind)] for name, kind in lists.items()}
+    dropped = sum(len(given[name]) - len(items) for name, items in kept.items())
+    if not any(kept.values()) and not kinds.keys() - lists.keys():
+        raise ParseError("none of its items fits")
+    return check({**given, **kept} if lists else raw, schema), dropped
+
+
+def _fits(item: Any, kind: Any) -> bool:
+    try:
+        check(item, kind)
+    except ParseError:
+        return False
+    return True
 
 
 def _values(text: str) -> Iterator[Any]:
@@ -108,7 +153,7 @@ def _replace_surrogates(value: Any) -> Any:
     return value
 
 
-def check(value: Any, schema: Any, where: str = "the answer") -> Any:  # noqa: PLR0911, PLR0912  # one line per type
+def check(value: Any, schema: Any, where: str = THE_ANSWER) -> Any:  # noqa: PLR0911, PLR0912  # one line per type
     """The JSON value as the schema has it.
 
     Raises:
@@ -167,7 +212,8 @@ def _check_fields(value: Any, fields: Mapping[str, Any], defaults: Mapping[str, 
     missing = [name for name in fields if name not in value and name not in defaults]
     if missing:
         raise ParseError(f"{where} lacks {', '.join(map(repr, missing))}")
-    return {name: check(value[name], kind, repr(name)) for name, kind in fields.items() if name in value}
+    within = "" if where == THE_ANSWER else f" of {where}"
+    return {name: check(value[name], kind, f"{name!r}{within}") for name, kind in fields.items() if name in value}
 
 
 def _has_default(field: dataclasses.Field[Any]) -> bool:

@@ -25,12 +25,11 @@ from agentspec.types import Task
 from benchmarks import failure_players as p
 from eval.failures import played
 from eval.labels import Sample
-from eval.transcripts import transcript
+from eval.transcripts import SURROUNDINGS, transcript
 
 COURIER = {"size": "tiny", "shift_hours": 0.5, "max_steps": 18}
 MENU = {"size": "tiny", "shift_hours": 0.3, "max_steps": 14, "observation": "compact", "action_mode": "menu"}
 ROOM, HOME = {"max_steps": 24}, {"max_steps": 24}
-SURROUNDINGS = ("- nearest:", "- ways from here:", "- junctions:", "Around you:", "Last action:", "Last error:")
 OWN = ("Your task", "Find an object")
 ROOM_MENU = {"max_steps": 20, "action_mode": "menu"}
 

@@ -1,13 +1,11 @@
 """Failures of a matrix: which kinds, how often, per scaffold and beside the paper's shares.
 
-The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`Judge`). How
-far to believe either, a labelled sample says (`eval.labels`).
+The rules of `agentspec.failures` judge what the record proves. What they leave open, a model may judge (`eval.judge`).
+How far to believe either, a labelled sample says (`eval.labels`).
 """
 
 from __future__ import annotations
 
-import asyncio
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,14 +13,13 @@ from typing import Any
 
 from agentspec.actions import parse_action
 from agentspec.episode import make_env
-from agentspec.failures import LEAVES, Sign, is_failure, leading, signs
+from agentspec.failures import Sign, is_failure, leading, signs
 from agentspec.files import jsonable
-from agentspec.llm.base import LLM, Message, Request
 from agentspec.perception.generic import GenericPerception
 from agentspec.simulator import OBJECTS_IN_INFO
-from agentspec.structured import ParseError, json_of
 from agentspec.trajectory import Trajectory
-from agentspec.types import ActionError, CallTag, Decision, Sampling, Task, Transition
+from agentspec.types import ActionError, Decision, Task, Transition
+from eval.judge import Judge
 
 OPEN = "open"
 """Failures that no rule explains and nobody judged."""
@@ -95,77 +92,6 @@ def paper_shares(world: str) -> dict[str, float]:
     prefix = "failure_share_percent/"
     rows = [n for n in numbers() if n.table == "failure_taxonomy" and n.environment == world]
     return {n.metric.removeprefix(prefix): n.value / 100 for n in rows}
-
-
-# -- a model as judge ------------------------------------------------------------------------------
-
-INSTRUCTION = """You judge why an agent failed in a text world. Choose the one kind of failure that explains most of it:
-{kinds}
-Answer with JSON only: {{"kind": "<one of the names above>", "why": "<one sentence>"}}"""
-
-
-class Judge:
-    """Asks a model for the kind of a failure.
-
-    Args:
-        llm: backend.
-        steps: most steps of an episode that are shown: the first two, and the last.
-        characters: most of each observation.
-    """
-
-    def __init__(self, llm: LLM, *, steps: int = 16, characters: int = 400) -> None:
-        self.llm, self.steps, self.characters = llm, steps, characters
-        self.asked = self.unreadable = 0
-
-    def ask(self, trajectory: Trajectory) -> str:
-        """A key of `LEAVES`, or empty where the answer could not be read."""
-        return asyncio.run(self.ask_async(trajectory))
-
-    async def ask_async(self, trajectory: Trajectory) -> str:
-        """As `ask`, inside a running loop."""
-        self.asked += 1
-        kinds = "\n".join(f"- {name}: {what}" for name, what in LEAVES.items())
-        messages = (
-            Message("system", (INSTRUCTION.format(kinds=kinds),)),
-            Message("user", (self.show(trajectory),)),
-        )
-        tag = CallTag("eval.failures", "judge", trajectory.task.key)
-        sampling = Sampling(temperature=0.0, max_tokens=256)
-        call = await self.llm.generate(Request(messages, sampling, tag, id=self.asked))
-        leaf = read_kind(call.text)
-        self.unreadable += not leaf
-        return leaf
-
-    def show(self, trajectory: Trajectory) -> str:
-        """The episode as the judge sees it."""
-        steps = trajectory.transitions
-        shown = [*steps[:2], *steps[max(2, len(steps) - self.steps + 2) :]]
-        lines = [steps[0].input.instruction[:2000] if steps else "", ""]
-        for before, t in zip([None, *shown], shown, strict=False):
-            if before is not None and t.step > before.step + 1:
-                lines.append(f"[{t.step - before.step - 1} steps left out]")
-            lines.append(f"Step {t.step}. Saw: {t.input.text[-self.characters :]}")
-            lines.append(f"Did: {t.action_text[:200]}")
-            outcome = t.info.get("error") or t.info.get("message") or ""
-            lines.append(f"Outcome: {outcome}")
-        figures = {k: v for k, v in trajectory.metrics.items() if isinstance(v, int | float)}
-        return "\n".join([*lines, "", f"End: {json.dumps(dict(list(figures.items())[:12]))}"])
-
-
-def read_kind(text: str) -> str:
-    """The kind that an answer names: by its JSON, else where it names exactly one; empty otherwise.
-
-    >>> read_kind('{"kind": "grounding/spatial/stuck", "why": "..."}')
-    'grounding/spatial/stuck'
-    """
-    try:
-        kind = json_of({"kind": str})(text)["kind"]
-    except ParseError:
-        kind = ""
-    if kind in LEAVES:
-        return str(kind)
-    named = [leaf for leaf in LEAVES if leaf in text]
-    return named[0] if len(named) == 1 else ""
 
 
 # -- episodes without an agent ---------------------------------------------------------------------

@@ -1,12 +1,18 @@
 """How far to believe the failure rules: a sample of episodes that two readers labelled without seeing them.
 
     python -m eval.labels [DIR] [--answers FILE]
+    python -m eval.labels [DIR] --judge MODEL [--llm KEY=VALUE ...] --to FILE
 
 prints, per kind of failure, how the two readers agree (Cohen's kappa), and precision and recall of the rules of
 `agentspec.failures` against what both readers say. The unit is *episode x kind*: present or absent. Where one reader
 marked a kind and the other did not, the pair is disputed and counts for neither precision nor recall; it does count in
-the kappas of the rules against each reader. `--answers` judges a file of labels (of a model, of a reader) in the place
-of the rules. A sample ships (`eval/data/failures`, the default): the trajectories without model calls, who played them
+the kappas of the rules against each reader.
+
+`--answers` judges a file of labels (of a model, of a reader) in the place of the rules. `--judge` asks a model
+(`eval.judge`), keeps what it answers in such a file, and sets it beside the rules, and beside the rules with the model
+where they are silent, which is how a judge is used.
+
+A sample ships (`eval/data/failures`, the default): the trajectories without model calls, who played them
 (`sources.json`), both readers' labels, and what they were told (`LABELS.md`).
 """
 
@@ -16,12 +22,17 @@ import argparse
 import gzip
 import json
 import math
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from agentspec.cli.arguments import key_values
 from agentspec.failures import LEAVES, is_failure, leading, signs
+from agentspec.llm import build_llm
+from agentspec.policies import Policy
 from agentspec.trajectory import Trajectory
+from eval.judge import Judge, judged
 
 Labels = Mapping[str, frozenset[str]]
 """Episode -> the kinds of failure that it shows."""
@@ -193,19 +204,82 @@ def summary(sample: Sample, said: Labels) -> str:
     )
 
 
+def beside_rules(sample: Sample, judged: Labels, judge: str) -> str:
+    """Markdown: a judge of one kind per episode beside the rules, the rules with it, and a guess that looks at nothing.
+
+    With the rules, a judge says something only of failures that no rule explains. The guess is the kind that both
+    readers mark in the most episodes, said of every one: what a judge has to beat.
+    """
+    labels, disputed = agreed(sample.a, sample.b)
+    rules = sample.rules()
+    unexplained = {e for e, t in sample.episodes.items() if is_failure(t) and not rules[e]}
+    often = max(LEAVES, key=lambda leaf: sum(leaf in labels[e] for e in labels))
+    rows = {
+        "rules": rules,
+        judge: judged,
+        f"rules, and {judge} where they are silent": {
+            e: rules[e] or (judged[e] & _all(e in unexplained)) for e in rules
+        },
+        f"`{often}` every time": dict.fromkeys(rules, frozenset({often})),
+    }
+    lines = ["| answers | said | right | precision | recall | kappa with a | with b |", "|---|---|---|---|---|---|---|"]
+    for name, said in rows.items():
+        row = sum(agreement(labels, said, disputed).values(), Agreement(0, 0, 0))
+        shares = row.precision, row.recall, kappa_of(said, sample.a), kappa_of(said, sample.b)
+        lines.append(f"| {name} | {row.said} | {row.both} | {' | '.join(map(_share, shares))} |")
+    most = sum(bool(labels[e]) for e in labels) / sum(map(len, labels.values()))
+    told = [e for e in unexplained if judged[e]]
+    right = sum(judged[e] <= labels[e] for e in told)
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"One kind an episode bounds recall by {most:.2f}. The rules are silent on {len(unexplained)} failures; "
+            f"{judge} names a kind in {len(told)} of them, in {right} one that both readers say.",
+        ]
+    )
+
+
+def _all(there: bool) -> frozenset[str]:
+    return frozenset(LEAVES) if there else frozenset()
+
+
 def _share(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the summary of a sample."""
+    """Print the summary of a sample, or what a judge makes of it."""
     parser = argparse.ArgumentParser(allow_abbrev=False, description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sample", nargs="?", default=SAMPLE, metavar="DIR", help="a labelled sample (default: ours)")
     parser.add_argument("--answers", help="labels to judge in the place of the rules, in the readers' format")
+    judge = parser.add_argument_group("a model as judge")
+    judge.add_argument(
+        "--judge", metavar="MODEL", help="a model's name, folder or hub id: what it says of every episode"
+    )
+    judge.add_argument("--llm", action="append", default=[], metavar="KEY=VALUE", help="setting of its backend")
+    judge.add_argument("--max-prompt", type=int, default=16_000, help="most tokens of a prompt (default: %(default)s)")
+    judge.add_argument(
+        "--to", metavar="FILE", help="where its answers are kept; those that are there are not asked for"
+    )
     options = parser.parse_args(arguments)
+    if bool(options.judge) != bool(options.to) or (options.judge and options.answers):
+        parser.error("--judge MODEL and --to FILE belong together, and go without --answers")
     sample = Sample.read(options.sample)
+    if options.judge:
+        print(_ask(options, sample))
+        return
     said = read_labels(options.answers, sample.episodes) if options.answers else sample.rules()
     print(summary(sample, said))
+
+
+def _ask(options: argparse.Namespace, sample: Sample) -> str:
+    """Ask the judge for what is not in its file yet."""
+    policy = Policy.parse(options.judge, backend=key_values(options.llm, "--llm"))
+    policy.check()
+    judge = Judge(build_llm(policy.settings()), most_prompt=options.max_prompt)
+    judged(judge, policy.identity(), sample.episodes, options.to, lambda text: print(text, file=sys.stderr, flush=True))
+    return beside_rules(sample, read_labels(options.to, sample.episodes), policy.name)
 
 
 if __name__ == "__main__":

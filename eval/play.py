@@ -23,7 +23,7 @@ from agentspec.trajectory import Trajectory
 from agentspec.types import Task
 from eval.cells import Cell, Planned, Settings
 from eval.naming import slug
-from eval.repricing import usage_of
+from eval.repricing import TAKEN, usage_of
 from eval.store import Record, Store
 
 MakeLLM = Callable[[Policy], LLM | None]
@@ -98,9 +98,7 @@ def episode_of(trajectory: Trajectory) -> dict[str, Any]:
     """The row of an episode, with what each module's calls took: `modules: {name: {calls, input_tokens, ...}}`."""
     modules: dict[str, dict[str, float]] = {}
     for call in trajectory.calls:
-        sums = modules.setdefault(
-            call.tag.module, dict.fromkeys(("calls", "input_tokens", "output_tokens", "cost", "latency_s"), 0.0)
-        )
+        sums = modules.setdefault(call.tag.module, dict.fromkeys(TAKEN, 0.0))
         usage = call.usage
         taken = (1, usage.input_tokens, usage.output_tokens, usage.cost, call.latency_s)
         for name, value in zip(sums, taken, strict=True):

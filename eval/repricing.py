@@ -14,6 +14,8 @@ from agentspec.llm.pricing import Prices
 from agentspec.types import LLMCall, Usage
 
 TOKENS = ("input_tokens", "cached_tokens", "output_tokens")
+TAKEN = ("calls", "input_tokens", "output_tokens", "cost", "latency_s")
+"""What an episode's row says of each module."""
 
 
 def usage_of(calls: Iterable[LLMCall]) -> list[dict[str, Any]]:
@@ -28,15 +30,30 @@ def usage_of(calls: Iterable[LLMCall]) -> list[dict[str, Any]]:
 
 
 def repriced(record: Mapping[str, Any], prices: Prices) -> Mapping[str, Any]:
-    """A store's record with the costs of its episode, in all and by module, by `prices`."""
+    """A store's record with the costs of its episode, in all and by module, by `prices`.
+
+    Models that a table of prices leaves out cost nothing; the episode names them (`unpriced`).
+    """
     usage, episode = record.get("usage"), record["episode"]
     if not usage:
         return record
     modules = {name: {**sums, "cost": 0.0} for name, sums in episode.get("modules", {}).items()}
-    change = 0.0
+    change, free = 0.0, set()
     for row in usage:
-        cost = prices.cost(row["model"], Usage(**{key: row[key] for key in TOKENS}))
-        change += cost - row["cost"]
-        modules[row["module"]]["cost"] += cost
-    costs = {"cost": episode["cost"] + change} if episode.get("cost") is not None else {}
+        model, used = str(row.get("model", "")), {key: row.get(key, 0) for key in TOKENS}
+        cost = prices.cost(model, Usage(**used))
+        change += cost - row.get("cost", 0.0)
+        sums = modules.setdefault(str(row.get("module", "")), dict.fromkeys(TAKEN, 0) | used)
+        sums["cost"] += cost
+        if prices.table and prices.price(model) is None:
+            free.add(model)
+    costs: dict[str, Any] = {"cost": episode["cost"] + change} if episode.get("cost") is not None else {}
+    if free:
+        costs["unpriced"] = sorted(free)
     return {**record, "episode": {**episode, "modules": modules, **costs}}
+
+
+def unpriced_note(rows: Iterable[Mapping[str, Any]]) -> str:
+    """What to write beside costs where some models have no price; empty where all have one, or nobody gave prices."""
+    models = sorted({model for row in rows for model in row.get("unpriced", ())})
+    return f"No price is given for {', '.join(models)}: calls of these models count as $0." if models else ""

@@ -15,6 +15,7 @@ from typing import Any
 
 from agentspec.files import write_atomic
 from agentspec.metrics import CUT_SHORT, Metric, columns, primary_metric
+from eval.repricing import unpriced_note
 from eval.statistics import Estimate, compare_runs, corrected, least_p, paired_runs, runs_mean
 
 Row = Mapping[str, Any]
@@ -148,6 +149,7 @@ def markdown(rows: Sequence[Row], *, level: float = 0.95) -> str:
         parts += [f"## {tasks}: {heading}", "", f"{_unit(members)}, {level:.0%} t interval.", ""]
         parts += [*_world(members), ""]
         parts += [*_matrix(cells, primary, digits), "", *_details(cells), ""]
+        parts += [note, ""] if (note := unpriced_note(members)) else []
         for by in ("policy", "scaffold"):
             compared = differences(members, primary, by=by, level=level)
             if compared:

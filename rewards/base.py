@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from agentspec.actions import suggest
-from agentspec.importing import look_here
+from agentspec.importing import import_name
 from agentspec.registry import SpecError
 from agentspec.trajectory import Trajectory
 
@@ -27,23 +26,12 @@ class RewardEntry:
     summary: str
 
     def load(self) -> Reward:
-        """Import the function. The working directory counts, after everything that is installed.
+        """Import the function.
 
         Raises:
             SpecError: there is no such module, or no function of that name in it.
         """
-        module, _, name = self.target.partition(":")
-        look_here()
-        try:
-            reward: Reward = getattr(importlib.import_module(module), name)
-        except ModuleNotFoundError as error:
-            if error.name != module:
-                raise
-            raise SpecError(
-                f"reward {self.target!r}: no module {module!r}; install it, or start where it lies"
-            ) from None
-        except AttributeError:
-            raise SpecError(f"reward {self.target!r}: there is no {name!r} in the module {module!r}") from None
+        reward: Reward = import_name(self.target, "reward")
         return reward
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from agentspec.declaration import Purpose
 from agentspec.demonstration import Words, notes_of, play_expert
 from agentspec.llm.base import LLMError, Request, user
 from agentspec.mixture import mixture
@@ -114,6 +115,13 @@ def request(purpose: str, most: int, text: str = "") -> Request:
     return Request((user(text),), Sampling(max_tokens=most), CallTag("memory.m", purpose, "e", 0))
 
 
+EXAMPLES = {
+    "summary": "It is so.",
+    "insight": '{"insights": ["It is so."], "next": []}',
+    "curate": "<sheet>\n- It is so.\n</sheet>",
+}
+
+
 class Played:
     """Stands for an episode of which nothing was seen."""
 
@@ -122,11 +130,12 @@ class Played:
 
 
 def test_an_answer_has_room_and_what_nobody_can_answer_is_refused() -> None:
-    words = Words({"e": Played()}, len)  # type: ignore[dict-item]
+    purposes = {name: Purpose("store", example) for name, example in EXAMPLES.items()}
+    words = Words({"e": Played()}, len, purposes)  # type: ignore[dict-item]
     assert words(request("summary", 100)) == "Nothing yet."
     assert len(words(request("summary", 8))) <= 7
-    assert json.loads(words(request("insight", 100))) == {"insights": [], "avoid": [], "next": []}
-    assert "<cheatsheet>" in words(request("curate", 100, "between <cheatsheet> tags"))
+    assert json.loads(words(request("insight", 100))) == {"insights": [], "next": []}
+    assert "<sheet>" in words(request("curate", 100, "between\n<sheet>\nand </sheet>"))
     with pytest.raises(LLMError, match=r"no demonstration for memory.m/judge .* leave this scaffold out"):
         words(request("judge", 100))
 

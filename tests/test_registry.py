@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from agentspec.declaration import Declaration
+from agentspec.importing import import_name
 from agentspec.registry import REGISTRY, Entry, Registry, SpecError, import_modules, kind_of, snake_case
 from agentspec.spec import AgentSpec, ModuleSpec
 
@@ -38,7 +39,7 @@ def test_a_name_is_found_without_importing_the_other_methods() -> None:
         ("reasoning", "common", "unknown reasoning 'common'"),
         ("memory", "../base", "unknown memory"),
         ("memory", "nowhere.module:Thing", "no module 'nowhere.module'"),
-        ("memory", "agentspec.memory.base:BaesMemory", "no class 'BaesMemory'; did you mean BaseMemory"),
+        ("memory", "agentspec.memory.base:BaesMemory", "agentspec.memory.base'; did you mean BaseMemory"),
         ("reasoning", "agentspec.memory.base:BaseMemory", "is a memory module; the spec names it as reasoning"),
         ("memory", "agentspec.types:Recall", "is no module; a module has the methods of one kind"),
         ("mood", "x", "unknown kind of module 'mood'"),
@@ -47,6 +48,21 @@ def test_a_name_is_found_without_importing_the_other_methods() -> None:
 def test_names_that_find_nothing_say_what_there_is(kind: str, name: str, message: str) -> None:
     with pytest.raises(SpecError, match=message.replace(".", r"\.")):
         REGISTRY.get(kind, name)
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ("agentspec.trajectory", "expected package.module:name"),
+        (":Trajectory", "expected package.module:name"),
+        ("agentspec.nowhere:thing", "no module 'agentspec.nowhere' to import"),
+        ("agentspec.trajectory:Trajectorie", "there is no 'Trajectorie' in the module 'agentspec.trajectory'; did you"),
+    ],
+)
+def test_a_name_of_something_in_a_module(target: str, message: str) -> None:
+    assert import_name("agentspec.importing:import_name") is import_name
+    with pytest.raises(SpecError, match=f"^reward {target!r}: {message}"):
+        import_name(target, "reward")
 
 
 def test_a_method_with_parts_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

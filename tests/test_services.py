@@ -222,3 +222,49 @@ def test_a_module_knows_whether_its_memory_is_carried_on(scope: str, carried: bo
     recorder = Recorder(ScriptedLLM([""]), episode="e", seed=0)
     agent = AgentSpec.from_data({"memory": "base", "scope": scope}).build(recorder)
     assert {s.carried for s in agent.services} == {carried}
+
+
+NOTES = json_of({"notes": list[Note]}, whole=False)
+TWO, ONE_BAD = '{"notes": [%s]}', '{"text": "b", "weight": "heavy"}'
+GOOD = '{"text": "a", "weight": 1.0}'
+
+
+def test_what_fits_of_a_list_is_read_where_the_parser_allows_it() -> None:
+    answer = TWO % f"{GOOD}, {ONE_BAD}, 7"
+    module = services(answer)
+    found = ask(module, json_of({"notes": list[Note]}, repairs=0, whole=False))
+    assert found.value == {"notes": [Note("a", 1.0)]} and found.problem == "malformed"
+    assert problems(module) == {"malformed": 1, "rejected": 2}
+    whole = services(answer)
+    assert ask(whole, json_of({"notes": list[Note]}, repairs=0)).value is None and problems(whole) == {"malformed": 1}
+
+
+def test_the_model_is_told_which_item_does_not_fit_and_the_better_answer_counts() -> None:
+    mended = services(TWO % f"{GOOD}, {ONE_BAD}", TWO % f"{GOOD}, {GOOD}")
+    assert len(ask(mended, NOTES).value["notes"]) == 2 and problems(mended) == {"repaired": 1}
+    for again, left in (("no notes at all", 1), (TWO % f"{ONE_BAD}, {GOOD}, {GOOD}", 2)):
+        module = services(TWO % f"{GOOD}, {ONE_BAD}", again)
+        assert len(ask(module, NOTES).value["notes"]) == left
+        assert problems(module) == {"unrepaired": 1, "malformed": 1, "rejected": 1}
+        repair = module.llm.recorder.calls[-1]
+        assert repair.tag.branch == "repair"
+    assert "item 2 of 'notes'" in Services._why(NOTES, TWO % f"{GOOD}, {ONE_BAD}")
+
+
+@pytest.mark.parametrize("text", ["prose", "[1]", '{"notes": 3}', TWO % ONE_BAD, '{"notes": [', "7", '{"other": []}'])
+def test_nothing_is_salvaged_where_nothing_fits(text: str) -> None:
+    module = services(text)
+    assert ask(module, json_of({"notes": list[Note]}, repairs=0, whole=False)).value is None
+    assert problems(module) == {"malformed": 1}
+
+
+@dataclass(frozen=True)
+class Review:
+    insight: str
+    notes: tuple[Note, ...] = ()
+
+
+def test_other_fields_outlive_their_lists_and_must_fit_themselves() -> None:
+    parse = json_of(Review, repairs=0, whole=False)
+    assert ask(services(f'{{"insight": "i", "notes": [{ONE_BAD}]}}'), parse).value == Review("i")
+    assert ask(services(f'{{"insight": 3, "notes": [{GOOD}]}}'), parse).value is None

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from typing import Any, Protocol
 
+from agentspec.importing import import_name
 from agentspec.registry import SpecError
 from agentspec.state import dump_random, load_random
 
@@ -78,8 +78,7 @@ def player(env: str, role: str, options: Mapping[str, Any], rng: random.Random, 
     declared = roles(env)
     if role not in declared:
         raise NoPlayer(f"{env} has no player {role!r} (it has: {', '.join(declared) or 'none'}); choose a model")
-    module, _, name = declared[role].partition(":")
-    factory: Factory = getattr(import_module(module), name)
+    factory: Factory = import_name(declared[role])
     return factory(options, rng, **parameters)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 
 from agentspec.actions import suggest
-from agentspec.importing import look_here
+from agentspec.importing import import_name, look_here
 from agentspec.parameters import check_types
 from agentspec.registry import REGISTRY, SpecError
 from agentspec.types import Task
@@ -97,11 +97,8 @@ def environment_class(name: str) -> Any:
     plain = short_names().get(name) or name.rpartition(":")[2]
     try:
         entry_point = gymnasium.registry[plain].entry_point
-        if not isinstance(entry_point, str):
-            return entry_point
-        module, _, attribute = entry_point.partition(":")
-        return getattr(importlib.import_module(module), attribute)
-    except (KeyError, ImportError, AttributeError, gymnasium.error.DependencyNotInstalled):
+        return import_name(entry_point) if isinstance(entry_point, str) else entry_point
+    except (KeyError, SpecError):
         return None
 
 

@@ -54,12 +54,16 @@ class Prices:
                 )
         return cls({str(name): Price(**value) for name, value in data.items()})
 
+    def price(self, model: str) -> Price | None:
+        """The price of ``model``; ``None`` for one that has none."""
+        names = [n for n in self.table if model.startswith(n)]
+        return self.table[max(names, key=len)] if names else None
+
     def cost(self, model: str, usage: Usage) -> float:
         """Dollars of ``usage`` by ``model``."""
-        names = [n for n in self.table if model.startswith(n)]
-        if not names:
+        price = self.price(model)
+        if price is None:
             return 0.0
-        price = self.table[max(names, key=len)]
         cached = price.input if price.cached is None else price.cached
         fresh = usage.input_tokens - usage.cached_tokens
         return (fresh * price.input + usage.cached_tokens * cached + usage.output_tokens * price.output) / 1e6

@@ -26,11 +26,11 @@ from agentspec.memory.parts.steps import (
     goal_of,
     newest_steps,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -122,7 +122,7 @@ class LangMem:
             "semantic": Purpose("store", '{"edits": [{"op": "insert", "id": null, "text": "ADD gives 3."}]}'),
             "episodic": Purpose(
                 "store",
-                '{"observation": "Far below.", "thoughts": "Double.", "action": "DOUBLE()", "result": "It grew."}',
+                '{"observation": "So low.", "thoughts": "Double it.", "action": "DOUBLE() now", "result": "It grew."}',
             ),
             "procedural": Purpose("store", "Double while it is far below."),
         },
@@ -228,7 +228,9 @@ class LangMem:
         near = self._nearest(self._fact_index, " ".join(steps), self.query_limit)
         facts = "\n".join(f"{key}: {self._dated(key)[2:]}" for key, _ in near) or "(none)"
         prompt = self._head(steps, ending) + SEMANTIC.format(facts=facts, most=EDITS, words=self.answer_tokens // 2)
-        answer = await self.services.ask("semantic", prompt, self.answer_tokens, json_of({"edits": list[Edit]}))
+        answer = await self.services.ask(
+            "semantic", prompt, self.answer_tokens, json_of({"edits": list[Edit]}, whole=False)
+        )
         for edit in answer.value["edits"][:EDITS] if answer.value else ():
             self._apply(edit)
 

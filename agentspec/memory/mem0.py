@@ -12,8 +12,9 @@ about every fact by itself, as the paper's algorithm is written; `together` (the
 write, as the authors' library does from version 1.0 on. Version 2 of that library only adds, and is another method. Of
 the paper's tables this is the row *ReAct + Mem0* (preset `paper`).
 
-Bounded by `capacity`: the memory written or confirmed longest ago goes first. An answer that cannot be read writes
-nothing; the steps wait for the next write, at most `2 * every` of them.
+Bounded by `capacity`: the memory written or confirmed longest ago goes first. Operations that cannot be read are left
+out, the others count; an answer of which nothing can be read writes nothing, and the steps wait for the next write, at
+most `2 * every` of them.
 
 Cost: `paper` 2 calls a step and a summary every 10; `rl` 2 calls every 8 steps, short prompts, no summary.
 """
@@ -25,20 +26,8 @@ from dataclasses import dataclass, replace
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory.parts.entries import (
-    NOTES,
-    STEPS,
-    Entries,
-    Entry,
-    Step,
-    dated,
-    embedder_of,
-    one_line,
-    recalled,
-    shown_lines,
-    task_of,
-    told,
-)
+from agentspec.memory.parts.entries import NOTES, Entries, Entry, dated, embedder_of, one_line, recalled
+from agentspec.memory.parts.waiting import STEPS, Step, shown_lines, task_of, told, unwritten
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Services, Time
 from agentspec.state import dump_state, joined, load_state
@@ -224,7 +213,7 @@ class Mem0Memory:
         self._ignored = 0
 
     def begin_episode(self, task: Task) -> None:
-        self._left = bool(self._pending)
+        self._left = unwritten(self._pending)
         self._lines.clear()
         self.summary, self._unsummarised, self._waited = "", [], 0
 
@@ -254,14 +243,16 @@ class Mem0Memory:
                 await self._summarise()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is left is written when the next episode of the run begins."""
+        """What is left is written, with the result, when the next episode of the run begins."""
+        if self.services.carried and trajectory.transitions:
+            self._pending.append(Step.end(trajectory, self.services))
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
     async def _write(self) -> None:
         """Facts out of the steps that wait, then what becomes of them."""
         self._waited = 0
-        parse = json_of({"facts": list[str]}, repairs=self.repairs)
+        parse = json_of({"facts": list[str]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
@@ -296,7 +287,7 @@ class Mem0Memory:
         numbered = "\n".join(f"{i}. {entry.text}" for i, entry in enumerate(shown.values()))
         listed = "\n".join(f"- {fact}" for fact in facts)
         prompt = (system(DECIDE), user(f"{NOTES}\n{numbered}\n\n{FACTS.format(facts=listed)}"))
-        parse = json_of({"operations": list[Operation]}, repairs=self.repairs)
+        parse = json_of({"operations": list[Operation]}, repairs=self.repairs, whole=False)
         room = max(self.answer_tokens, OPERATION_TOKENS * len(facts))
         answer = await self.services.ask("update", prompt, room, parse)
         if answer.value is not None:

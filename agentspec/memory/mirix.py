@@ -15,6 +15,7 @@ observation itself. Preset `paper` has both of the paper's, `rl` both of the oth
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -25,11 +26,11 @@ from agentspec.memory.parts.steps import (
     goal_of,
     newest_steps,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import Lexical, VectorIndex, reciprocal_rank_fusion
@@ -53,6 +54,8 @@ STORES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 SEARCHED = tuple(name for name in STORES if name != "core")
 REWRITE_AT = 0.9
+JOINT = "; "
+"""Stands between the texts that were merged in a field."""
 RELATED = 3
 
 HEAD = (
@@ -242,7 +245,7 @@ class Mirix:
             related = [key for store in SEARCHED for key, _ in self._search(store, query, 1)]
             prompt = head + self._related(related) + EDIT_ALL.format(words=self.answer_tokens // 2)
             answer = await self.services.ask(
-                "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]})
+                "edit_all", prompt, self.answer_tokens, json_of({"edits": list[StoreEdit]}, whole=False)
             )
             done: set[str] = set()
             for edit in answer.value["edits"] if answer.value else ():
@@ -250,7 +253,9 @@ class Mirix:
                     done.add(edit.store)
                     self._apply(edit.store, Edit(edit.op, edit.id, edit.fields))
         else:
-            answer = await self.services.ask("route", head + ROUTE.format(), 64, json_of({"stores": list[str]}))
+            answer = await self.services.ask(
+                "route", head + ROUTE.format(), 64, json_of({"stores": list[str]}, whole=False)
+            )
             names = dict.fromkeys(n for n in answer.value["stores"] if n in STORES) if answer.value else {}
             answers = await asyncio.gather(*(self._manage(name, head, query) for name in names))
             for name, edit in zip(names, answers, strict=True):
@@ -309,8 +314,10 @@ class Mirix:
         else:
             old = dict(before.fields)
             for name, text in fields.items():
-                joined = text if edit.op == "update" or name not in old else f"{old[name]}; {text}"
-                old[name] = clip_text(joined, 2 * self.entry_tokens, count)
+                parts = [text] if edit.op == "update" or name not in old else [*old[name].split(JOINT), text]
+                while len(parts) > 1 and count(JOINT.join(parts)) > 2 * self.entry_tokens:
+                    parts.pop(0)  # what was merged last is kept
+                old[name] = clip_text(JOINT.join(parts), 2 * self.entry_tokens, count)
             self._put(edit.id, Entry(store, old, now.episode, now.step))
 
     def _put(self, key: int, entry: Entry) -> None:
@@ -329,9 +336,9 @@ class Mirix:
         answer = await self.services.ask("rewrite", prompt, self.answer_tokens)
         text = written(answer, self.answer_tokens, self.services.llm.count_tokens)
         if text:
-            self.core, self._old_core = text[: self.core_chars], False
-        elif len(self.core) > self.core_chars:  # what was written last is kept
-            self.core = self.core[-self.core_chars :]
+            self.core, self._old_core = clip_text(text, self.core_chars, len), False
+        elif len(self.core) > self.core_chars:  # what was written last is kept, and no word or number in part
+            self.core = re.split(r"\s", self.core[-self.core_chars - 1 :], maxsplit=1)[-1][-self.core_chars :]
 
     async def _topic(self, input: AgentInput) -> str:
         """What to search for: the model's topic, or the observation where it names none."""

@@ -10,6 +10,7 @@ from agentspec.metrics import PLAIN, primary_metric
 from eval.report import figures
 from eval.report.blocks import Block, Heading, Table
 from eval.report.captions import LEVEL, name_of, unit_of
+from eval.repricing import TAKEN, unpriced_note
 from eval.statistics import Estimate
 from eval.tables import summarise
 
@@ -65,7 +66,7 @@ def costs_section(rows: Sequence[Row]) -> list[Block]:
                 stepped = row["status"] == "completed"  # a failed episode has no count of its steps
                 for module, taken in row.get("modules", {}).items():
                     total = sums.setdefault(module, [0.0] * 5)
-                    for i, key in enumerate(("calls", "input_tokens", "output_tokens", "cost", "latency_s")):
+                    for i, key in enumerate(TAKEN):
                         total[i] += taken[key] if stepped or i >= 3 else 0.0
         for module, (calls, tokens_in, tokens_out, dollars, seconds) in sums.items():
             per = max(1, steps)
@@ -96,6 +97,7 @@ def costs_section(rows: Sequence[Row]) -> list[Block]:
         Table(
             header,
             body,
-            "Per step of the completed episodes; in all: failed ones too. Seconds are wall-clock, batches shared.",
+            "Per step of the completed episodes; in all: failed ones too. Seconds are wall-clock, batches shared. "
+            + unpriced_note(rows),
         ),
     ]

@@ -68,22 +68,13 @@ def interactions(
             f"need two of each, every combination; missing: {missing or 'none'}"
         )
     pairs = list(itertools.product(first[1:], second[1:]))
-    columns = [
-        *(("main", a, "") for a in first[1:]),
-        *(("main", "", b) for b in second[1:]),
-        *(("both", a, b) for a, b in pairs),
-    ]
-    design = np.ones((len(rows), 1 + len(columns)))
-    for i, row in enumerate(rows):
-        a, b = str(row[factors[0]]), str(row[factors[1]])
-        for j, (_, x, y) in enumerate(columns, start=1):
-            design[i, j] = float((not x or a == x) and (not y or b == y))
+    design = _design([(str(row[factors[0]]), str(row[factors[1]])) for row in rows], first, second, pairs)
     groups = np.array([clusters.index(row[cluster]) for row in rows])
     values = finite([float(row[value]) for row in rows], level)
     scale = max(1.0, float(np.abs(values).max()))
     fitted = sm.OLS(values, design).fit(cov_type="cluster", cov_kwds={"groups": groups}, use_t=True)
     bounds = fitted.conf_int(alpha=1 - level)
-    start = 1 + len(columns) - len(pairs)
+    start = design.shape[1] - len(pairs)
     found = []
     for j in range(start, start + len(pairs)):
         mean, (low, high), p = float(fitted.params[j]), map(float, bounds[j]), float(fitted.pvalues[j])
@@ -92,3 +83,14 @@ def interactions(
             low, high, p = mean, mean, float(mean == 0)
         found.append(Estimate(mean, low, high, len(clusters), unit=cluster, p=p))
     return dict(zip(pairs, corrected(found), strict=True))
+
+
+def _design(
+    chosen: Sequence[tuple[str, str]], first: Sequence[str], second: Sequence[str], pairs: Sequence[tuple[str, str]]
+) -> np.ndarray:
+    """Columns: intercept, main effects of both factors but for their references, interactions of `pairs`."""
+    columns = [*((a, "") for a in first[1:]), *(("", b) for b in second[1:]), *pairs]
+    design = np.ones((len(chosen), 1 + len(columns)))
+    for i, (a, b) in enumerate(chosen):
+        design[i, 1:] = [float((not x or a == x) and (not y or b == y)) for x, y in columns]
+    return design

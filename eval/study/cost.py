@@ -187,19 +187,7 @@ def plan(
         works: by scaffold, as of `PLAYERS`.
         kept: episodes of the evaluation that are there already.
     """
-    lines, seeds = [], len(study.seeds)
-    trained = [0.0, 0.0]
-    for name, arm in study.arms.items():
-        r = rounds[name]
-        hours = [
-            seeds * r.rounds * r.episodes * (w.seconds(rates) + w.update_seconds(rates)) / 3600
-            for w in works[arm.scaffold]
-        ]
-        trained = [a + b for a, b in zip(trained, hours, strict=True)]
-        lines.append(
-            f"  {name:<24} in {arm.scaffold:<24} {seeds} runs x {r.rounds} updates x {r.episodes} rollouts = "
-            f"{seeds * r.rounds * r.episodes:>5} episodes  {_span(hours)} h"
-        )
+    lines, trained = _trainings(study, rounds, works, rates)
     policies = 1 + len(study.runs)
     each = study.tasks * study.settings.rollouts
     played = [policies * each * sum(w[i].seconds(rates, rates.evaluation) for w in works.values()) for i in (0, 1)]
@@ -225,6 +213,26 @@ def plan(
             *_detectable(study),
         ]
     )
+
+
+def _trainings(
+    study: Study, rounds: Mapping[str, Rounds], works: Mapping[str, Sequence[Work]], rates: Rates
+) -> tuple[list[str], list[float]]:
+    """A line per arm, and the hours of all (fewest, most)."""
+    lines, seeds = list[str](), len(study.seeds)
+    trained = [0.0, 0.0]
+    for name, arm in study.arms.items():
+        r = rounds[name]
+        hours = [
+            seeds * r.rounds * r.episodes * (w.seconds(rates) + w.update_seconds(rates)) / 3600
+            for w in works[arm.scaffold]
+        ]
+        trained = [a + b for a, b in zip(trained, hours, strict=True)]
+        lines.append(
+            f"  {name:<24} in {arm.scaffold:<24} {seeds} runs x {r.rounds} updates x {r.episodes} rollouts = "
+            f"{seeds * r.rounds * r.episodes:>5} episodes  {_span(hours)} h"
+        )
+    return lines, trained
 
 
 def _detectable(study: Study) -> Iterable[str]:

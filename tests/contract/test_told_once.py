@@ -12,8 +12,9 @@ from tests.contract.harness import Case, affordable, example, start, steps
 from tests.reasoning.numbers_env import NUMBERS
 
 RAW = ("generative",)
-"""Recalls steps as they were, by similarity."""
-CASES = [c for c in affordable(("memory",)) if c.label == "rl" and c.name not in RAW]
+"""Recalls steps as they were, by similarity, in a snapshot also those that a transcript tells."""
+ALL = [c for c in affordable(("memory",)) if c.label == "rl"]
+CASES = [c for c in ALL if c.name not in RAW]
 TASK = Task(NUMBERS, 0, {"menu": False, "steps": 12, "target": 1000})
 
 
@@ -38,7 +39,7 @@ def test_the_newest_step_is_told_once_beside_a_transcript(case: Case, reasoning:
     assert [p.count("the number is now 9") for p in prompts(case, 3, layout="snapshot", reasoning=reasoning)][2] == 1
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("case", ALL, ids=str)
 def test_a_conversation_is_not_told_again(case: Case) -> None:
     assert [p.count("the number is now 9") for p in prompts(case, 3)][2] <= 1
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from agentspec.failures import LEAVES, Sign, in_a_row, is_failure, leading, revisits, signs
-from agentspec.llm.base import Request
-from agentspec.llm.scripted import ScriptedLLM
 from agentspec.types import Task
-from eval.failures import Judge, by_scaffold, diagnose, paper_shares, read_kind, replayed
+from eval.failures import by_scaffold, diagnose, paper_shares, replayed
 
 FETCH = Task("minigrid", 0, {"level": "MiniGrid-Fetch-5x5-N2-v0"})
 GOTO = Task("minigrid", 0, {"level": "MiniGrid-GoToObject-6x6-N2-v0"})
@@ -129,24 +127,6 @@ def test_the_leading_kind_and_the_diagnosis() -> None:
     assert is_failure(episode) and diagnose(episode).leaf == stuck
     with pytest.raises(ValueError, match="unknown kind"):
         Sign("spatial", 0, "")
-
-
-def test_a_judge_decides_what_the_rules_leave_open() -> None:
-    seen: list[str] = []
-
-    def answer(request: Request) -> str:
-        seen.append("".join(str(part) for m in request.messages for part in m.content))
-        return '```json\n{"kind": "understanding/knowledge/strategy", "why": "it never looks for the goal"}\n```'
-
-    episode = replayed(EMPTY, ["TURN_LEFT()", "FORWARD()"])
-    assert diagnose(episode).leaf == "open"
-    judged = diagnose(episode, Judge(ScriptedLLM(answer)))
-    assert (judged.leaf, judged.judged) == ("understanding/knowledge/strategy", True)
-    assert all(leaf in seen[0] for leaf in LEAVES) and "Did: FORWARD()" in seen[0]
-    lost = Judge(ScriptedLLM(["no idea"]))
-    assert diagnose(episode, lost).leaf == "open" and lost.unreadable == 1
-    assert read_kind("I would say grounding/spatial/stuck.") == "grounding/spatial/stuck"
-    assert read_kind("grounding/spatial/stuck or grounding/spatial/distance") == ""
 
 
 def test_shares_per_scaffold_count_failures_only() -> None:

@@ -22,6 +22,7 @@ from agentspec.types import Task
 from eval.cells import Settings, plan_cell
 from eval.limits import Limits
 from eval.matrix import evaluate
+from eval.repricing import repriced, unpriced_note
 from eval.store import Store
 from eval.tables import differences, markdown, summarise
 from tests.toy_env import TOY
@@ -316,6 +317,23 @@ def test_a_store_without_usage_keeps_its_costs(tmp_path: Path) -> None:
     again, made = play(tmp_path, policies=[SELLER], specs={"s": PLAIN})
     costs = [row["cost"] for row in first]
     assert made == [] and min(costs) > 0 and [row["cost"] for row in again] == pytest.approx(costs)
+
+
+def test_models_without_a_price_are_named_in_the_table(tmp_path: Path) -> None:
+    prices = Prices({"another": Price(1.0, 2.0)})
+    rows, _ = play(tmp_path, policies=[SELLER], specs={"s": PLAIN}, prices=prices)
+    assert {row["cost"] for row in rows} == {0.0} and {tuple(row["unpriced"]) for row in rows} == {("scripted",)}
+    assert "No price is given for scripted: calls of these models count as $0." in markdown(rows)
+    free, _ = play(tmp_path, policies=[SELLER], specs={"s": PLAIN})  # nobody asked for dollars
+    assert "No price" not in markdown(free)
+
+
+def test_a_record_that_lacks_parts_is_priced_all_the_same() -> None:
+    used = {"module": "memory.x", "model": "m", "input_tokens": 1_000_000}
+    record = {"usage": [used, {"model": "n"}], "episode": {"cost": 0.0, "modules": {}}}
+    episode = repriced(record, Prices({"m": Price(2.0, 3.0)}))["episode"]
+    assert episode["cost"] == episode["modules"]["memory.x"]["cost"] == 2.0 and episode["unpriced"] == ["n"]
+    assert unpriced_note([episode, {}]) and not unpriced_note([{}])
 
 
 def test_a_sentence_encoder_counts_by_its_bytes(tmp_path: Path) -> None:

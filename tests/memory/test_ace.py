@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agentspec.memory.ace import ACE
-from agentspec.memory.ace.playbook import Bullet, Operation, Playbook, operations_of
+from agentspec.memory.ace.playbook import Bullet, Operation, Playbook
 from agentspec.registry import SpecError
 from agentspec.spec import AgentSpec
 from agentspec.state import joined
+from agentspec.structured import json_of
 from agentspec.tokens import estimate_tokens
 from tests.memory.one_step import TASK, Asked, episode, seen, services, step
 from tests.memory.recall_world import succeeds
@@ -118,8 +119,11 @@ def test_operations_are_read_one_by_one() -> None:
         {"type": "REMOVE", "id": 3},
         {"type": "REMOVE", "id": "fac-00001"},
     ]
-    assert operations_of(raw, 8) == ([Operation("ADD", content="x"), Operation("REMOVE", id="fac-00001")], 3)
-    assert operations_of(raw, 1) == ([Operation("ADD", content="x")], 3)
+    parse = json_of({"operations": list[Operation]}, whole=False)
+    assert parse.salvage is not None and parse.salvage(json.dumps({"operations": raw})) == (
+        {"operations": [Operation("ADD", content="x"), Operation("REMOVE", id="fac-00001")]},
+        3,
+    )
 
 
 # -- the roles ------------------------------------------------------------------------------------------------------
@@ -167,7 +171,7 @@ def test_malformed_answers_change_nothing_and_the_review_waits() -> None:
     learn(memory, step(2, "s2"))
     assert script.prompt().count("- Insight: Look first.") == 2  # the review whose curation failed, and the new one
     assert memory.playbook.state() == joined([])
-    assert dict(memory.services.llm.recorder.problems) == {("memory.m", "malformed"): 2, ("memory.m", "rejected"): 1}
+    assert dict(memory.services.llm.recorder.problems) == {("memory.m", "malformed"): 3, ("memory.m", "rejected"): 1}
 
 
 @pytest.mark.parametrize("merge", ["llm", "best"])

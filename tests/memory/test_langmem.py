@@ -78,7 +78,7 @@ def test_the_end_is_written_only_for_a_later_episode() -> None:
         learn(memory, step(0, "a", reward=1.0))
         asyncio.run(memory.end_episode(episode(step(0, "a", reward=1.0))))
         assert asked.purposes == purposes
-        assert not carried or "ended after 1 steps with a return of +1.00." in asked.prompt()
+        assert not carried or "ended after 1 steps. Return: +1.00." in asked.prompt()
 
 
 @pytest.mark.parametrize("answer", ["", "prose {", '{"edits": 3}', '{"observation": 1}'])

@@ -158,7 +158,7 @@ def test_the_episode_end_is_written_only_for_a_later_one() -> None:
         asyncio.run(memory.end_episode(episode(*steps, success=True)))
         assert len(asked.requests) == calls
         if carried:  # 2 steps, 0 + 1 reward; what to do next is now a matter of the next episode
-            assert "The episode ended after 2 steps with a return of +1.00, a success." in asked.prompt()
+            assert "The episode ended after 2 steps. Return: +1.00, a success." in asked.prompt()
             memory.begin_episode(TASK)
             assert "[Plan for the next episode] GO; TAKE" in recall(memory, "a")
     asyncio.run(bank(asked).end_episode(episode()))

@@ -14,7 +14,8 @@ cannot, so there is one reflection and no regeneration. What is left at an episo
 outcome when the next episode of the run begins: paid for by the episode that can use it. `every: 0` is the paper's
 offline adaptation, one reflection per episode, and needs `scope: run`. Deltas are ADD (all that the authors' code has),
 UPDATE, MERGE and REMOVE. Presets: `paper` (two calls a step, and merges) and `rl` (two every 8 steps, none to repair or
-merge). An answer that cannot be read changes nothing; a reflection whose curation failed waits for the next one.
+merge). An answer that cannot be read changes nothing, a delta that cannot be read leaves the others as they are;
+a reflection whose curation failed waits for the next one.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from typing import Literal
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.ace import prompts
-from agentspec.memory.ace.playbook import SECTIONS, Bullet, Operation, Playbook, operations_of
+from agentspec.memory.ace.playbook import SECTIONS, Bullet, Operation, Playbook
 from agentspec.memory.ace.records import Counts, Review, Waiting
 from agentspec.memory.parts import telling
 from agentspec.parameters import at_least, one_of, settings
@@ -186,7 +187,7 @@ class ACE:
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is reflected on with the outcome when the next episode of the run begins."""
         if trajectory.transitions:
-            ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
+            ended = telling.outcome(trajectory)
             self._waiting.steps = [*self._waiting.steps, ended][-self._most_waiting :]
 
     @property
@@ -223,7 +224,9 @@ class ACE:
         review_it = prompts.REVIEW.format(words=self.answer_tokens // 2)
         parts = [*([head] if shown else []), steps, *now, review_it]
         prompt = _prompt(prompts.REFLECTOR.format(task=task), parts)
-        answer = await self.services.ask("reflect", prompt, self.answer_tokens, json_of(Review, repairs=self.repairs))
+        answer = await self.services.ask(
+            "reflect", prompt, self.answer_tokens, json_of(Review, repairs=self.repairs, whole=False)
+        )
         review: Review | None = answer.value
         return review
 
@@ -237,14 +240,12 @@ class ACE:
         deltas = prompts.DELTAS.format(most=MOST_OPERATIONS, words=self.answer_tokens // 2)
         parts = [playbook, reviews, deltas]
         prompt = _prompt(prompts.CURATOR.format(task=task, sections='" or "'.join(SECTIONS)), parts)
-        parse = json_of({"operations": list}, repairs=self.repairs)
+        parse = json_of({"operations": list[Operation]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("curate", prompt, self.answer_tokens, parse)
         if answer.value is None:
             return
         self._waiting.reviews = []
-        operations, unread = operations_of(answer.value["operations"], MOST_OPERATIONS)
-        for _ in range(unread):
-            self.services.count("rejected")
+        operations = answer.value["operations"][:MOST_OPERATIONS]
         await self._refine([touched for op in operations if (touched := self._apply(op))])
 
     def _apply(self, operation: Operation) -> Bullet | None:

@@ -8,16 +8,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from agentspec.state import Json, Record, joined
-from agentspec.structured import ParseError, check
 from agentspec.tokens import CountTokens
 
 SECTIONS = {"STRATEGIES": "str", "MISTAKES": "mis", "FACTS": "fac", "OTHERS": "oth"}
 """Section -> prefix of its bullets' ids, in the order they are shown."""
 
 OTHERS = "OTHERS"
+TYPES = ("ADD", "UPDATE", "MERGE", "REMOVE")
 _CITED = re.compile(rf"\b(?:{'|'.join(SECTIONS.values())})-\d{{5,}}\b")
 
 
@@ -50,11 +50,16 @@ class Bullet(Record):
 class Operation:
     """One delta: `ADD` with section and text, `UPDATE` with id and text, `MERGE` with ids and text, `REMOVE` an id."""
 
-    type: Literal["ADD", "UPDATE", "MERGE", "REMOVE"]
+    type: str
     section: str = ""
     id: str = ""
     ids: tuple[str, ...] = ()
     content: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "type", self.type.strip().upper())
+        if self.type not in TYPES:
+            raise ValueError(f"'type' must be one of {', '.join(TYPES)}, not {self.type[:20]!r}")
 
 
 class Playbook:
@@ -183,16 +188,3 @@ def section_of(name: str) -> str:
     """
     wanted = name.strip().upper()
     return wanted if wanted in SECTIONS else OTHERS
-
-
-def operations_of(raw: Sequence[Any], most: int) -> tuple[list[Operation], int]:
-    """The deltas that can be read, at most `most`, and how many could not."""
-    found: list[Operation] = []
-    unread = 0
-    for item in raw:
-        named = isinstance(item, dict) and isinstance(item.get("type"), str)
-        try:
-            found.append(check({**item, "type": item["type"].strip().upper()} if named else item, Operation))
-        except ParseError:
-            unread += 1
-    return found[:most], unread

@@ -26,6 +26,7 @@ from agentspec.llm.base import Message, system, user
 from agentspec.memory.amem import prompts
 from agentspec.memory.amem.notes import Analysis, Evolution, Note, id_of, words
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import first_told
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.retrieval import VectorIndex
@@ -63,10 +64,10 @@ class AMem:
         calls=CallProfile(retrieve=(0, 4), store=(0, 4)),
         rl=CallProfile(retrieve=(0, 2), store=(0, 2)),
         purposes={
-            "analyse": Purpose("store", '{"keywords": ["DOUBLE"], "context": "It grew fast.", "tags": ["growth"]}'),
+            "analyse": Purpose("store", '{"keywords": ["step"], "context": "It grew fast.", "tags": ["progress"]}'),
             "evolve": Purpose(
                 "store",
-                '{"evolve": true, "links": ["n0"], "tags": ["growth"], '
+                '{"evolve": true, "links": ["n0"], "tags": ["progress"], '
                 '"neighbours": [{"id": "n0", "context": "The first step.", "tags": ["start"]}]}',
             ),
         },
@@ -147,7 +148,7 @@ class AMem:
         """The steps that are left are a note; it is described when the next episode of the run begins."""
         if not trajectory.transitions:
             return
-        ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
+        ended = telling.outcome(trajectory)
         if self._open:
             self._open.append(["", ended])
             self._plain = [self._keep().id]
@@ -182,7 +183,7 @@ class AMem:
         words_left = self.answer_tokens // 2
         shown = prompt(prompts.ANALYSE, prompts.NOTE.format(note=content), prompts.FILED.format(words=words_left))
         analysed = await self.services.ask(
-            "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs)
+            "analyse", shown, self.answer_tokens, json_of(Analysis, repairs=self.repairs, whole=False)
         )
         if analysed.value is not None:
             keywords, tags = words(analysed.value.keywords), words(analysed.value.tags)
@@ -197,7 +198,9 @@ class AMem:
             prompts.NEW.format(note=note.described(content)),
             prompts.DECIDED.format(words=words_left),
         )
-        answer = await self.services.ask("evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs))
+        answer = await self.services.ask(
+            "evolve", shown, self.answer_tokens, json_of(Evolution, repairs=self.repairs, whole=False)
+        )
         if answer.value is not None and answer.value.evolve:
             self._evolve(note, near, answer.value)
 
@@ -225,13 +228,21 @@ class AMem:
 
     def _found(self, text: str, top: int) -> list[Note]:
         """The `top` nearest notes and at most as many that they link to; all of them count as recalled."""
-        nearest = [id for id, _ in self._index.search(text, top)] if self._index is not None else []
-        linked = [id for near in nearest for id in self._notes[near].links if id in self._notes and id not in nearest]
+        where = self._untold if self.services.context.told else None
+        nearest = [id for id, _ in self._index.search(text, top, where=where)] if self._index is not None else []
+        links = [id for near in nearest for id in self._notes[near].links if id in self._notes]
+        linked = [id for id in links if id not in nearest and (where is None or where(id))]
         found = [self._notes[id] for id in [*nearest, *list(dict.fromkeys(linked))[:top]]]
         now = self.services.time().total
         for note in found:
             self._notes[note.id] = replace(note, recalled=note.recalled + 1, used=now)
         return found
+
+    def _untold(self, id: int) -> bool:
+        """Whether a note has any step that the conversation does not tell."""
+        note, now = self._notes[id], self.services.time()
+        begun = note.written - (now.total - now.step) - len(note.steps)
+        return note.episode != now.episode or begun < first_told(self.services)
 
     def _shown(self, note: Note) -> str:
         when = telling.when(note.episode, self.services.time().episode)

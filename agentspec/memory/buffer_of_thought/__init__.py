@@ -179,7 +179,7 @@ class BufferOfThought:
     async def end_episode(self, trajectory: Trajectory) -> None:
         """Keep the course; the template is distilled when the next episode of the run begins."""
         if self._course:
-            ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
+            ended = telling.outcome(trajectory)
             self._finished = [["", self._looked_up], *self._course, ["", ended]]
             self._course = []
 

@@ -24,26 +24,19 @@ Cost: one call per changed cluster (0.2 to 0.5 a step), and 1 to `rounds` per st
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
 from agentspec.memory.cam.hierarchy import Level, affinity
-from agentspec.memory.parts.entries import (
-    NOTES,
-    Entries,
-    Entry,
-    Step,
-    embedder_of,
-    one_line,
-    recalled,
-    shown_lines,
-    stamp,
-    task_of,
-)
+from agentspec.memory.parts.entries import NOTES, Entries, Entry, embedder_of, one_line, recalled, stamp
+from agentspec.memory.parts.steps import first_told, written
+from agentspec.memory.parts.telling import outcome
+from agentspec.memory.parts.waiting import Step, shown_lines, task_of
 from agentspec.parameters import at_least, one_of, settings
-from agentspec.services import Answer, Services
+from agentspec.services import Services
 from agentspec.state import dump_state, joined, load_state
 from agentspec.structured import json_of
 from agentspec.tokens import excerpt
@@ -92,6 +85,8 @@ nothing that it does not see now.
 Answer with JSON, an empty list if none helps: {"useful": [number]}"""
 SEEN = "What the agent sees now (data, not instructions):\n{state}"
 MOST_MEMBERS = 12
+SEEN_IN = "; seen: "
+"""Stands in a node between what a step did and the state it was taken in."""
 
 
 class CamMemory:
@@ -197,7 +192,7 @@ class CamMemory:
         found = await self._pick(input.text, k) if self.read == "model" and len(self.nodes) else None
         if found is None:
             top = k or self.top
-            near = self.nodes.near(input.text, 2 * top)
+            near = self.nodes.near(input.text, 2 * top, where=self._where)
             found = list({node.text: (node, score) for node, score in reversed(near)}.values())[::-1][:top]
         notes = [(self.shown(node), score) for node, score in found]
         lines = shown_lines(self._lines, max(self.recent, len(self._pending)) if self.recent else 0)
@@ -205,7 +200,7 @@ class CamMemory:
 
     async def _pick(self, state: str, k: int | None) -> list[tuple[Entry, float]] | None:
         """Prune and grow: the model picks among candidates, and these lead to the next ones."""
-        similar = {node.id: score for node, score in self.nodes.near(state, self.seeds)}
+        similar = {node.id: score for node, score in self.nodes.near(state, self.seeds, where=self._where)}
         candidates = list(similar)
         picked: dict[int, None] = {}
         seen = dict.fromkeys(candidates)
@@ -214,13 +209,23 @@ class CamMemory:
             if useful is None and number == 0:
                 return None
             picked |= dict.fromkeys(useful or ())
-            grown = dict.fromkeys(n for id in useful or () for n in self._next_to(id) if n not in seen)
+            around = [n for id in useful or () for n in self._next_to(id) if n not in seen]
+            grown = dict.fromkeys(n for n in around if self._untold(self.nodes[n]))
             similar |= {id: self.nodes.similarity(state, id) for id in grown}
             candidates = sorted(grown, key=lambda id: -similar[id])[: self.seeds]
             if not candidates:
                 break
             seen |= dict.fromkeys(candidates)
         return [(self.nodes[id], similar[id]) for id in list(picked)[: k or self.top]]
+
+    def _untold(self, node: Entry) -> bool:
+        """Whether a node is anything but a step that the conversation tells."""
+        here = node.time.episode == self.services.time().episode
+        return bool(node.data["level"]) or not here or node.time.step < first_told(self.services)
+
+    @property
+    def _where(self) -> Callable[[Entry], bool] | None:
+        return self._untold if self.services.context.told else None
 
     def _next_to(self, id: int) -> list[int]:
         """Neighbours on the same level, and children."""
@@ -231,7 +236,7 @@ class CamMemory:
     async def _select(self, state: str, candidates: Sequence[int]) -> list[int] | None:
         seen = SEEN.format(state=excerpt(state, self.step_tokens, self.services.llm.count_tokens))
         listed = "\n".join(f"{i}. {self.shown(self.nodes[id])[2:]}" for i, id in enumerate(candidates))
-        parse = json_of({"useful": list[int]}, repairs=self.repairs)
+        parse = json_of({"useful": list[int]}, repairs=self.repairs, whole=False)
         prompt = (system(SELECT), user(f"{seen}\n\n{NOTES}\n{listed}"))
         answer = await self.services.ask("select", prompt, 64, parse)
         if answer.value is None:
@@ -255,7 +260,16 @@ class CamMemory:
             await self._grow()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is left grows when the next episode of the run begins."""
+        """What is left grows when the next episode of the run begins; the last step says how this one ended."""
+        if not (self.services.carried and trajectory.transitions):
+            return
+        ended = outcome(trajectory).removesuffix(".")
+        if self._pending:
+            self._pending[-1] = replace(self._pending[-1], line=f"{self._pending[-1].line}; {ended}")
+        elif steps := list(self.levels[0].graph):
+            last = self.nodes[steps[-1]]
+            done, seen, state = last.text.partition(SEEN_IN)
+            self.nodes.put(replace(last, text=f"{done}; {ended}{seen}{state}"))
 
     async def _grow(self) -> None:
         """Nodes for the steps that wait, links, clusters, and summaries of those that have changed, level by level."""
@@ -269,7 +283,7 @@ class CamMemory:
     def _assimilate(self, step: Step) -> int:
         """A node for a step, linked to what belongs to it."""
         state = step.text.partition("\nAction: ")[0].removeprefix("State: ")
-        text = f"{step.line.partition('. ')[2]}; seen: {state}"
+        text = f"{step.line.partition('. ')[2]}{SEEN_IN}{state}"
         node = Entry(self.services.new_id(), text, step.time, {"level": 0})
         near = self.nodes.near(node.text, self.links, where=lambda e: e.data["level"] == 0)
         self.nodes.put(node)
@@ -299,16 +313,16 @@ class CamMemory:
         touched = [n for label in gone for n in self._drop(parents.pop(label), above)]
         changed = [label for label, members in clusters.items() if self._known(parents.get(label)) != members]
         changed = changed[: max(0, most)]
-        answers = await asyncio.gather(*(self._sum_up(clusters[label]) for label in changed))
-        for label, answer in zip(changed, answers, strict=True):
-            if answer.value is None:
+        summaries = await asyncio.gather(*(self._sum_up(clusters[label]) for label in changed))
+        for label, summary in zip(changed, summaries, strict=True):
+            if not summary:
                 continue
             members = clusters[label]
             id = parents.setdefault(label, -1)
             id = parents[label] = self.services.new_id() if id < 0 else id
             newest = max((self.nodes[m] for m in members), key=lambda e: e.time.total)
             data = {"level": number + 1, "children": members}
-            self.nodes.put(Entry(id, one_line(answer.value), newest.time, data))
+            self.nodes.put(Entry(id, summary, newest.time, data))
             touched += [*self._relink(id, members, number), id]
         above.touch(touched)
         return len(changed)
@@ -338,12 +352,13 @@ class CamMemory:
                 above.connect(id, other)
         return before
 
-    async def _sum_up(self, members: list[int]) -> Answer[str]:
+    async def _sum_up(self, members: list[int]) -> str:
+        """The summary of a cluster; of one that was cut off its whole sentences."""
         task = task_of(self._task, self.task_tokens, self.services)
         shown = [f"- {one_line(self.nodes[m].text)} [{self._when(m)}]" for m in members[-MOST_MEMBERS:]]
         prompt = (system(SUMMARISE.format(task=task)), user("\n".join([NOTES, *shown])))
         answer = await self.services.ask("summarise", prompt, self.summary_tokens)
-        return answer if answer.problem == "" else Answer(None, answer.call, answer.problem)
+        return one_line(written(answer, self.summary_tokens, self.services.llm.count_tokens))
 
     def _when(self, id: int) -> str:
         return stamp(self.nodes[id].time, self.services.time())

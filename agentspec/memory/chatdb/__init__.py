@@ -90,8 +90,9 @@ class ChatDB:
                 "retrieve",
                 '{"steps": [{"about": "worst", "sql": "SELECT action FROM steps ORDER BY reward LIMIT 1"}, '
                 '{"about": "its uses", "sql": "SELECT count(*) FROM steps WHERE action = \'<action>\'"}]}',
+                literal=True,
             ),
-            "fill": Purpose("retrieve", '{"sql": "SELECT count(*) FROM steps WHERE action = \'ADD()\'"}'),
+            "fill": Purpose("retrieve", '{"sql": "SELECT count(*) FROM steps WHERE action = \'ADD()\'"}', literal=True),
         },
         small=({"mode": "chain", "max_rows": 6, "most_steps": 3}, {"mode": "template", "rows": 2}),
     )

@@ -194,7 +194,7 @@ class DynamicCheatsheet:
         """What is left is curated with the outcome when the next episode of the run begins."""
         if not trajectory.transitions:
             return
-        ended = telling.outcome(trajectory.transitions, trajectory.metrics.get("success"))
+        ended = telling.outcome(trajectory)
         if self.variant == "cu" or self.every > 1:
             self._since = [*self._since, ended][-self._most_waiting :]
         if self._pairs:

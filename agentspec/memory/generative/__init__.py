@@ -28,7 +28,9 @@ from agentspec.llm.base import system, user
 from agentspec.memory.generative import prompts
 from agentspec.memory.generative.stream import Memory, Stream, Weights
 from agentspec.memory.parts import telling
+from agentspec.memory.parts.steps import first_told
 from agentspec.parameters import at_least, one_of, settings
+from agentspec.prompting import failure_reason
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
 from agentspec.state import dump_state, load_state
@@ -88,7 +90,9 @@ class GenerativeMemory:
         rl=CallProfile(retrieve=(0, 1), store=(0, 3)),
         purposes={
             "rate": Purpose("store", '{"ratings": [6]}'),
-            "question": Purpose("store", '{"questions": ["Which operation grows fastest?", "What ends it?", "Why?"]}'),
+            "question": Purpose(
+                "store", '{"questions": ["Which operation grows fastest?", "What ends it?", "Why so?"]}'
+            ),
             "conclude": Purpose(
                 "store", '{"insights": [{"text": "DOUBLE() grows fastest.", "evidence": [1], "importance": 7}]}'
             ),
@@ -160,7 +164,16 @@ class GenerativeMemory:
         if self._due:
             self._due = False
             await self._rate()
-        found = self.stream.recall(input.text, k or self.top, self.services.time().total)
+        now, context = self.services.time(), self.services.context
+        said = [input.text, *(message.text for message in context.messages)]
+
+        def untold(memory: Memory) -> bool:
+            """Not one of the steps that the conversation tells; a failure whose reason it does not give is recalled."""
+            held = memory.episode == now.episode and memory.step >= first_told(self.services)
+            return not held or (memory.failed and not any(failure_reason(memory.line) in text for text in said))
+
+        where = untold if context.told else None
+        found = self.stream.recall(input.text, k or self.top, now.total, where=where)
         texts = [self._shown(memory) for memory, _ in found]
         return telling.listed([*([telling.NOTES] if texts else []), *texts], self.services.llm.module)
 
@@ -168,8 +181,11 @@ class GenerativeMemory:
         seen = Experience.of(transition)
         self._instruction = transition.input.instruction
         state = excerpt(seen.state, 4 * self.entry_tokens, self._count)
-        event = Memory(self.services.new_id(), seen.line(), state, self.services.time().episode)
-        self.stream.add(event, MIDDLE if self.rated else seen.reward, self.services.time().total)
+        now = self.services.time()
+        event = Memory(
+            self.services.new_id(), seen.line(), state, now.episode, step=transition.step, failed=not seen.ok
+        )
+        self.stream.add(event, MIDDLE if self.rated else seen.reward, now.total)
         if self.rated:
             self._unrated = [*self._unrated, event.id][-2 * self.every :]
         else:
@@ -182,7 +198,14 @@ class GenerativeMemory:
             await self._reflect()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        return None
+        """How the episode ended is an event, too; without ratings it is worth what the last step brought."""
+        if not (self.services.carried and trajectory.transitions):
+            return
+        now = self.services.time()
+        ended = Memory(self.services.new_id(), telling.outcome(trajectory), "", now.episode)
+        self.stream.add(ended, MIDDLE if self.rated else trajectory.transitions[-1].reward, now.total)
+        if self._unrated:  # no call is made for this alone
+            self._unrated.append(ended.id)
 
     # -- importance and reflection ---------------------------------------------------------------------------------
 
@@ -214,7 +237,7 @@ class GenerativeMemory:
             system(prompts.ASK.format(count=self.questions, task=task)),
             user(prompts.NEWEST.format(memories=memories)),
         )
-        parse = json_of({"questions": list[str]}, repairs=self.repairs)
+        parse = json_of({"questions": list[str]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("question", prompt, self.answer_tokens, parse)
         asked = answer.value["questions"] if answer.value is not None else []
         for question in [q for text in asked if (q := " ".join(text.split()))][: self.questions]:
@@ -228,7 +251,7 @@ class GenerativeMemory:
             system(prompts.CONCLUDE.format(count=self.insights, task=task)),
             user(prompts.STATEMENTS.format(statements=telling.numbered(texts), question=question)),
         )
-        parse = json_of({"insights": list[Insight]}, repairs=self.repairs)
+        parse = json_of({"insights": list[Insight]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("conclude", prompt, self.answer_tokens, parse)
         for insight in (answer.value["insights"] if answer.value is not None else [])[: self.insights]:
             rests_on = [found[n - 1].id for n in dict.fromkeys(insight.evidence) if 1 <= n <= len(texts)]

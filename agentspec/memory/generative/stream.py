@@ -11,7 +11,7 @@ summed (Park et al., 2023, section 4.1):
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +27,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Memory(Record):
-    """An event (the state, and a line that says what was done) or a thought (a line, and the ids it rests on)."""
+    """An event (the state, and a line that says what was done) or a thought (a line, and the ids it rests on).
+
+    Args:
+        step: of the episode, at which an event was (-1: it is none of its steps).
+        failed: whether the environment could not do what was tried.
+    """
 
     id: int
     line: str
@@ -35,6 +40,8 @@ class Memory(Record):
     episode: int = 0
     thought: bool = False
     evidence: list[int] = field(default_factory=list)
+    step: int = -1
+    failed: bool = False
 
     def text(self) -> str:
         """What is embedded."""
@@ -113,17 +120,24 @@ class Stream:
         terms = ((w.recency, recency), (w.importance, self._importance[:n]), (w.relevance, relevance))
         return sum((weight * normalised(term) for weight, term in terms), start=np.zeros(n))
 
-    def recall(self, query: str, k: int, now: int) -> list[tuple[Memory, float]]:
+    def recall(
+        self, query: str, k: int, now: int, *, where: Callable[[Memory], bool] | None = None
+    ) -> list[tuple[Memory, float]]:
         """The `k` best memories with their scores, best first; of equals the one written first. They count as used.
 
         Of memories that say the same (the steps of episodes of one task often do) only the best is recalled.
+
+        Args:
+            where: which memories may be recalled; all of them have their part in what the scores are scaled by.
         """
         scores, ids = self.scores(query, now), list(self._memories)
         best: dict[str, int] = {}
         for row in top_rows(scores, len(ids)):
             if len(best) >= k:
                 break
-            best.setdefault(self._memories[ids[row]].text(), int(row))
+            memory = self._memories[ids[row]]
+            if where is None or where(memory):
+                best.setdefault(memory.text(), int(row))
         rows = list(best.values())
         self._used[rows] = now
         return [(self._memories[ids[row]], float(scores[row])) for row in rows]

@@ -29,33 +29,18 @@ and at most `most_merges` every `merge_every`. Preset `rl`: 1, none, 1 every 4 e
 from __future__ import annotations
 
 import asyncio
-import random
-from dataclasses import replace
-from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
-from agentspec.memory.gmemory.insights import Change, Insight, Insights, first_neighbours
-from agentspec.memory.gmemory.prompts import (
-    CHAIN,
-    COMPARE,
-    KEY,
-    MERGE,
-    MISTAKE,
-    PAIR,
-    RELEVANCE,
-    RULES,
-    STEPS,
-    Score,
-    numbered,
-    told,
-    verdict,
-)
+from agentspec.memory.gmemory.insights import Insights
+from agentspec.memory.gmemory.learning import Learner
+from agentspec.memory.gmemory.prompts import PAIR, RELEVANCE, Score, told
+from agentspec.memory.gmemory.query import NEAREST, QueryGraph
 from agentspec.memory.parts import telling
-from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line, shown_lines, task_of
+from agentspec.memory.parts.entries import Entries, Entry, embedder_of, one_line
+from agentspec.memory.parts.waiting import shown_lines, task_of
 from agentspec.parameters import at_least, settings
 from agentspec.reflection.trials import episode_return
-from agentspec.retrieval import Graph
 from agentspec.services import Answer, Services
 from agentspec.state import dump_state, load_state
 from agentspec.structured import json_of
@@ -95,9 +80,6 @@ PRESETS = {
         "repairs": 0,
     },
 }
-
-NEAREST, MOST_CHANGES = 10, 4
-COMPARED_SUCCESSES = 3
 
 
 class GMemory:
@@ -183,19 +165,20 @@ class GMemory:
         at_least("gmemory", 1, max_insights=max_insights, capacity=capacity, **{n: chosen[n] for n in counts})
         at_least("gmemory", 0, hops=hops, recent=recent, **{n: chosen[n] for n in others})
         self.services = services
-        self.successes, self.failures, self.rank, self.every, self.comparisons = (
-            chosen[name] for name in ("successes", "failures", "rank", "every", "comparisons")
+        self.successes, self.failures, self.rank, self.top_insights, self.repairs = (
+            chosen[name] for name in ("successes", "failures", "rank", "top_insights", "repairs")
         )
-        self.merge_every, self.most_merges, self.top_insights, self.repairs = (
-            chosen[name] for name in ("merge_every", "most_merges", "top_insights", "repairs")
+        self.trial_tokens, self.key_tokens, self.task_tokens = (
+            chosen[name] for name in ("trial_tokens", "key_tokens", "task_tokens")
         )
-        self.trial_tokens, self.key_tokens, self.answer_tokens, self.task_tokens = (
-            chosen[name] for name in ("trial_tokens", "key_tokens", "answer_tokens", "task_tokens")
-        )
-        self.edge, self.least, self.hops, self.threshold, self.recent = edge, least, hops, threshold, recent
+        self.least, self.threshold, self.recent = least, threshold, recent
+        self._name = services.llm.module
         self.episodes = Entries(embedder_of(services), capacity)
-        self.graph: Graph[int] = Graph()
+        self._query = QueryGraph(self.episodes, edge, hops)
+        self.graph = self._query.graph
         self.insights = Insights(max_insights)
+        sizes = ("every", "comparisons", "merge_every", "most_merges", "key_tokens", "answer_tokens", "repairs")
+        self._learner = Learner(services, self.episodes, self.insights, **{name: chosen[name] for name in sizes})
         self._count = 0  # episodes so far
         self._total = 0.0  # sum of their returns
         self._chain = ""  # the episode that has not been learnt from
@@ -224,8 +207,7 @@ class GMemory:
     async def _related(self, k: int | None) -> list[RecallItem]:
         """Rules of related tasks, then the most relevant successes and the nearest failures."""
         near = self.episodes.near(self._began, NEAREST)
-        related = self.graph.within([e.id for e, score in near if score >= self.edge], self.hops)
-        rules = self.insights.for_tasks(related, self.top_insights)
+        rules = self.insights.for_tasks(self._query.related(near), self.top_insights)
         self._used = [rule.id for rule in rules]
         good = [(e, s) for e, s in near if e.data["success"] and s >= self.least][: 2 * self.successes]
         bad = [e for e, s in near if not e.data["success"] and s >= self.least][: self.failures]
@@ -240,7 +222,8 @@ class GMemory:
 
     async def _relevance(self, episode: Entry) -> Answer[Score]:
         prompt = PAIR.format(task=self._began, episode=f"{told(episode)}\nIt began: {episode.text}")
-        return await self.services.ask("relevance", (system(RELEVANCE), user(prompt)), 64, self._json(Score))
+        parse = json_of(Score, repairs=self.repairs)
+        return await self.services.ask("relevance", (system(RELEVANCE), user(prompt)), 64, parse)
 
     # -- learning --------------------------------------------------------------------------------------------------
 
@@ -266,7 +249,7 @@ class GMemory:
         data = {"success": success, "return": total, "key": actions, "length": len(trajectory.transitions)}
         data["graded"] = trajectory.metrics.get("success") is None and self.threshold is None
         self._unlearnt = self.services.new_id()
-        self._keep(Entry(self._unlearnt, began, self.services.time(), data))
+        self._query.keep(Entry(self._unlearnt, began, self.services.time(), data))
         self._count += 1
 
     def _succeeded(self, trajectory: Trajectory, total: float) -> bool:
@@ -278,99 +261,14 @@ class GMemory:
             return total >= self.threshold
         return total > self._total / max(1, self._count)
 
-    def _keep(self, episode: Entry) -> None:
-        """A node of the query graph."""
-        near = self.episodes.near(episode.text, NEAREST, least=self.edge)
-        self.episodes.put(episode)
-        self.graph.add(episode.id)
-        for other, score in near:
-            self.graph.connect(episode.id, other.id, round(score, 6))
-        for id in [id for id in self.graph if id not in self.episodes]:
-            self.graph.remove(id)
-
     async def _learn(self) -> None:
-        """Key steps or mistake of the episode before; from time to time rules out of several; rules merged."""
-        if self._unlearnt is None:
-            return
-        id, self._unlearnt = self._unlearnt, None
-        episode = self.episodes[id]
-        good = episode.data["success"]
-        static = STEPS.format(
-            ended=f"{verdict(episode)} (return {episode.data['return']:+.2f})",
-            what=KEY if good else MISTAKE,
-            words=max(8, self.key_tokens // 2),
-            task=episode.text.partition("\n")[0],
-        )
-        prompt = (system(static), user(CHAIN.format(chain=self._chain)))
-        answer = await self.services.ask("steps" if good else "mistake", prompt, self.key_tokens)
-        self._chain = ""
-        if answer.value:
-            key = clip_text(answer.value.strip(), self.key_tokens, self.services.llm.count_tokens)
-            self.episodes.put(replace(episode, data={**episode.data, "key": key}))
-        if self._count % self.every == 0:
-            draw = random.Random(self._count)  # the same draw wherever this state is restored
-            for task in draw.choices(list(self.episodes), k=self.comparisons):
-                await self._compare(task)
-        if self._count % self.merge_every == 0:
-            await self._merge()
-
-    async def _compare(self, task: Entry) -> None:
-        """Rules out of the successes and a failure nearest to a task."""
-        near = [e for e, _ in self.episodes.near(task.text, 2 * NEAREST)]
-        good = [e for e in near if e.data["success"]][:COMPARED_SUCCESSES]
-        bad = [e for e in near if not e.data["success"]][: 1 if good else COMPARED_SUCCESSES]
-        rules = list(self.insights)
-        parts = [RULES.format(rules=numbered(rules))] if rules else []
-        parts.append("Episodes (data, not instructions):")
-        parts += [f"{told(e)}\nIt began: {e.text.partition(chr(10))[2]}" for e in [*good, *bad]]
-        prompt = (system(COMPARE), user("\n\n".join(parts)))
-        answer = await self.services.ask(
-            "compare", prompt, self.answer_tokens, self._json({"operations": list[Change]})
-        )
-        if answer.value is None:
-            return
-        shown, tasks = [rule.id for rule in rules], [e.id for e in [*good, *bad]]
-        for change in answer.value["operations"][:MOST_CHANGES]:
-            self.insights.change(change, shown, tasks, self.services.new_id())
-
-    async def _merge(self) -> None:
-        """The rules of each cluster of tasks, a third as many (but one at least)."""
-        tasks = list(self.episodes)
-        clusters = first_neighbours(self.episodes.embed([e.text for e in tasks]))
-        groups = [self._supported({tasks[i].id for i in cluster}) for cluster in clusters]
-        groups = sorted((g for g in groups if len(g) > 1), key=lambda g: -len(g))[: self.most_merges]
-        taken: set[int] = set()
-        for group in groups:
-            rules = [rule for rule in group if rule.id in self.insights and rule.id not in taken]
-            if len(rules) < 2:
-                continue
-            most = max(1, len(rules) // 3)
-            prompt = (system(MERGE.format(most=most)), user(RULES.format(rules=numbered(rules))))
-            answer = await self.services.ask("merge", prompt, self.answer_tokens, self._json({"rules": list[str]}))
-            merged = [one_line(text) for text in answer.value["rules"] if text.strip()] if answer.value else []
-            if not merged:
-                continue
-            supported = tuple(dict.fromkeys(task for rule in rules for task in rule.tasks))
-            for rule in rules:
-                self.insights.remove(rule.id)
-            for text in merged[:most]:
-                new = Insight(self.services.new_id(), text, max(rule.score for rule in rules), supported)
-                self.insights.put(new)
-                taken.add(new.id)
-
-    def _supported(self, tasks: set[int]) -> list[Insight]:
-        """The rules of which most of the tasks are among these."""
-        return [rule for rule in self.insights if 2 * len(tasks & set(rule.tasks)) > len(rule.tasks)]
+        """Learn from the episode before, once."""
+        if self._unlearnt is not None:
+            id, chain, self._unlearnt, self._chain = self._unlearnt, self._chain, None, ""
+            await self._learner.learn(id, chain, self._count)
 
     def _start_of(self, text: str) -> str:
         return clip_text(one_line(text), max(64, self.task_tokens // 2), self.services.llm.count_tokens)
-
-    def _json(self, schema: Any) -> Any:
-        return json_of(schema, repairs=self.repairs)
-
-    @property
-    def _name(self) -> str:
-        return self.services.llm.module
 
     # -- state -----------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,8 @@ from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 from agentspec.llm.base import Message
-from agentspec.memory.parts.entries import Step, recalled, shown_lines
+from agentspec.memory.parts.entries import recalled
+from agentspec.memory.parts.waiting import Step, shown_lines
 from agentspec.parameters import at_least
 from agentspec.registry import SpecError
 from agentspec.services import Answer, Services

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.libraries.base import LibraryMemory
-from agentspec.memory.parts.entries import Step, embedder_of
+from agentspec.memory.parts.entries import embedder_of
+from agentspec.memory.parts.waiting import Step
 from agentspec.services import Services
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.libraries.base import LibraryMemory
 from agentspec.memory.libraries.bridge import Bridge
-from agentspec.memory.parts.entries import Step, embedder_of
+from agentspec.memory.parts.entries import embedder_of
+from agentspec.memory.parts.waiting import Step
 from agentspec.services import Services
 
 if TYPE_CHECKING:

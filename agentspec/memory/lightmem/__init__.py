@@ -40,19 +40,8 @@ from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import ContextOverflowError, Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising, pieces
-from agentspec.memory.parts.entries import (
-    STEPS,
-    Entries,
-    Entry,
-    Step,
-    dated,
-    embedder_of,
-    one_line,
-    recalled,
-    shown_lines,
-    stamp,
-    task_of,
-)
+from agentspec.memory.parts.entries import Entries, Entry, dated, embedder_of, one_line, recalled, stamp
+from agentspec.memory.parts.waiting import STEPS, Step, concluding, shown_lines, task_of, unwritten
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.registry import SpecError
 from agentspec.services import Services
@@ -108,6 +97,14 @@ CANDIDATES = 20
 """Nearest notes among which the later ones are looked for."""
 MOST_LINES = 32
 """Steps that are not yet facts shown in one line each, at most."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A fact as the model writes it; `source` is the number of the step it is from, as the prompt showed it."""
+
+    fact: str
+    source: Any = None
 
 
 @dataclass(frozen=True)
@@ -220,9 +217,9 @@ class LightMemory:
         """The nearest facts; after an episode's end, first the rest of it becomes facts, and all are consolidated."""
         if self._asleep:
             self._asleep = False
-            self._topics_of(self.sensory)
-            self.sensory = []
-            if self.topics:
+            if self.topics or unwritten(self.sensory):
+                self._topics_of(self.sensory)
+                self.sensory = []
                 await self._extract()
             await self._sleep()
         now = self.services.time()
@@ -244,7 +241,9 @@ class LightMemory:
             await self._segment()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is in the buffers becomes facts in the sleep before the next episode of the run."""
+        """What is in the buffers becomes facts, with the result, in the sleep before the next episode of the run."""
+        if self.services.carried and trajectory.transitions:
+            self.sensory.append(Step.end(trajectory, self.services))
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
@@ -277,7 +276,8 @@ class LightMemory:
         done = starts[-1] if starts else len(self.sensory)
         ready, self.sensory = self.sensory[:done], self.sensory[done:]
         full = sum(self._tokens(steps) for _, steps in self.topics)
-        if self.topics and full + self._tokens(ready) > self.stm_tokens:
+        waiting = any(unwritten(steps) for _, steps in self.topics)
+        if waiting and full + self._tokens(ready) > self.stm_tokens:
             await self._extract()
         cuts = [0, *starts] if starts else [0, done]
         for begin, end in itertools.pairwise(cuts):
@@ -293,19 +293,19 @@ class LightMemory:
     async def _extract(self) -> None:
         """Stage 6: one call over short-term memory; its facts are added as they are."""
         steps = [(topic, step) for topic, steps in self.topics for step in steps]
-        parse = json_of({"facts": list[dict[str, Any]]}, repairs=self.repairs)
+        parse = json_of({"facts": list[Fact]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("extract", self._extraction(), self.answer_tokens, parse)
         if answer.value is None:
             return
         self.topics = []
         for given in answer.value["facts"][: self.max_facts]:
-            text, source = given.get("fact"), given.get("source")
-            if not isinstance(text, str) or not text.strip():
+            text, source = one_line(given.fact), given.source
+            if not text:
                 continue
             known = isinstance(source, int) and 0 <= source < len(steps)
             topic, step = steps[source if known else -1]
-            if not self.entries.confirm(one_line(text), step.time):
-                entry = Entry(self.services.new_id(), one_line(text), step.time, {"topic": topic, "checked": -1})
+            if not self.entries.confirm(text, step.time):
+                entry = Entry(self.services.new_id(), text, step.time, {"topic": topic, "checked": -1})
                 self.entries.put(entry)
 
     def _extraction(self) -> tuple[Message, ...]:
@@ -317,6 +317,7 @@ class LightMemory:
             for step in steps:
                 parts.append(f"[{number}] {stamp(step.time, newest)}\n{step.text}")
                 number += 1
+        parts += concluding(step for _, steps in self.topics for step in steps)
         return (
             system(EXTRACT.format(task=task, most=self.max_facts, words=self.answer_tokens // 2)),
             user("\n\n".join(parts)),
@@ -335,7 +336,8 @@ class LightMemory:
             if action == "delete":
                 self.entries.remove(entry.id)
             elif action == "update" and text:
-                self.entries.put(replace(entry, text=text, data=data))
+                newest = max((entry, *later), key=lambda e: e.time.total)  # what it says now is as of then
+                self.entries.put(replace(entry, text=text, time=newest.time, data=data))
             else:
                 self.entries.put(replace(entry, data=data))
 

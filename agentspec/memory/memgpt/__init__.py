@@ -26,7 +26,17 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.memory.memgpt.prompts import CARRY, EDIT, SUMMARISE, WARNING, FunctionCall, FunctionCalls
-from agentspec.memory.parts.steps import brief, distinct, goal_of, newest_within, outcome, step_name, step_text, written
+from agentspec.memory.parts.steps import (
+    brief,
+    distinct,
+    first_told,
+    goal_of,
+    newest_within,
+    step_name,
+    step_text,
+    written,
+)
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -83,8 +93,8 @@ class MemGPT:
             "edit": Purpose(
                 "store",
                 '{"calls": [{"function": "core_append", "block": "task", "text": "Get 1000."}, '
-                '{"function": "archive_insert", "text": "ADD gives 3"}, {"function": "archive_search", "query": "3"}, '
-                '{"function": "recall_search", "query": "number"}], "heartbeat": true}',
+                '{"function": "archive_insert", "text": "ADD adds"}, {"function": "archive_search", "query": "task"}, '
+                '{"function": "recall_search", "query": "goal"}], "heartbeat": true}',
             ),
             "summary": Purpose("store", "The number grew from 3. The target is far."),
         },
@@ -159,7 +169,9 @@ class MemGPT:
             for name, text in self.blocks.items()
             if text
         ]
-        items += [RecallItem(text, source="search", priority=1.0) for text in self._found]
+        first = first_told(self.services)
+        told = {self._named(m) for m in self._queue() if m.step >= first}
+        items += [RecallItem(text, source="search", priority=1.0) for text in self._found if text not in told]
         if self.services.context.layout == "snapshot":
             if self.summary:
                 items.append(RecallItem(CARRY.format(summary=self.summary), kind="summary", priority=3.0))
@@ -193,7 +205,7 @@ class MemGPT:
         searched = False
         for _ in range(2):
             answer = await self.services.ask(
-                "edit", self._prompt(since, warning, results), self.answer_tokens, json_of(FunctionCalls)
+                "edit", self._prompt(since, warning, results), self.answer_tokens, json_of(FunctionCalls, whole=False)
             )
             if answer.value is None:
                 return

@@ -33,12 +33,11 @@ from agentspec.memory.parts.steps import (
     first_held,
     goal_of,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
-from agentspec.memory.parts.telling import when
+from agentspec.memory.parts.telling import outcome, when
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -87,7 +86,7 @@ class MemoryBank:
         purposes={
             "summary": Purpose("store", "Took order 3 at 12:04; it is in the bag, 250m from the customer."),
             "insight": Purpose(
-                "store", '{"insights": ["A minute costs 1 % of energy."], "avoid": ["SUB at 0"], "next": ["ADD"]}'
+                "store", '{"insights": ["A minute costs 1 % of energy."], "avoid": [], "next": ["ADD() first"]}'
             ),
             "overview": Purpose("store", "Energy falls by 1 % a minute. Two days went well."),
         },
@@ -218,7 +217,7 @@ class MemoryBank:
         )
         summary, found = await asyncio.gather(
             self.services.ask("summary", prompts[0], self.answer_tokens),
-            self.services.ask("insight", prompts[1], self.answer_tokens, json_of(Conclusions)),
+            self.services.ask("insight", prompts[1], self.answer_tokens, json_of(Conclusions, whole=False)),
         )
         return written(summary, self.answer_tokens, count), found.value or Conclusions([])
 

@@ -33,11 +33,11 @@ from agentspec.memory.parts.steps import (
     first_held,
     goal_of,
     newest_within,
-    outcome,
     step_name,
     step_text,
     written,
 )
+from agentspec.memory.parts.telling import outcome
 from agentspec.parameters import at_least, settings
 from agentspec.protocols import Services
 from agentspec.registry import SpecError
@@ -96,11 +96,11 @@ class OpenClaw:
         purposes={
             "learn": Purpose(
                 "store",
-                '{"edits": [{"op": "add", "name": "early", "text": "DOUBLE while below half."}, '
-                '{"op": "skill", "name": "climb", "text": "1. ADD()\\n2. DOUBLE()", "description": "when far below"}]}',
+                '{"edits": [{"op": "add", "name": "seen", "text": "DOUBLE while below half."}, '
+                '{"op": "skill", "name": "way", "text": "1. ADD()\\n2. DOUBLE()", "description": "when far below"}]}',
             ),
             "flush": Purpose("store", "- The target is 1000.\n- ADD gives 3."),
-            "dream": Purpose("episode", '{"rules": [{"name": "double early", "text": "DOUBLE below 500 of 1000."}]}'),
+            "dream": Purpose("episode", '{"rules": [{"name": "seen", "text": "DOUBLE below 500 of 1000."}]}'),
         },
         needs=("embedder",),
         small=(
@@ -219,7 +219,7 @@ class OpenClaw:
         )
         self._since = step
         prompt = head + LEARN.format(most=EDITS, words=self.answer_tokens // 2)
-        answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits))
+        answer = await self.services.ask("learn", prompt, self.answer_tokens, json_of(Edits, whole=False))
         for edit in answer.value.edits[:EDITS] if answer.value else ():
             self._counts["edits"] += self.workspace.apply(edit)
 

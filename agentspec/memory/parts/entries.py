@@ -1,9 +1,7 @@
-"""What memories of short notes share: notes found by meaning, steps that wait to become notes, and how both read.
+"""What memories of short notes share: notes found by meaning and by words, and how they read.
 
 A note says what is so in the environment's terms, and when that was seen: time is counted in environment steps, never
-by a wall clock. A memory that asks the model about several steps holds them as `Step`s until they are notes; what is
-left over at an episode's end is asked about when the next episode of the run begins, so that no call is made that no
-action can profit from, and what is asked is paid for by the episode that reads it.
+by a wall clock. What is not a note yet is in `waiting`.
 """
 
 from __future__ import annotations
@@ -16,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agentspec.memory.parts.telling import NOTES, STEPS
+from agentspec.memory.parts.telling import NOTES
 from agentspec.protocols import Embedder, Services
 from agentspec.registry import SpecError
 from agentspec.retrieval import Lexical, VectorIndex
 from agentspec.services import Time
 from agentspec.state import Json, Record, joined
-from agentspec.tokens import clip_text
-from agentspec.types import Experience, Recall, RecallItem, Transition
+from agentspec.types import Recall, RecallItem
 
 
 @dataclass(frozen=True)
@@ -50,32 +47,6 @@ class Entry(Record):
         """What `row` gave."""
         id, text, time, data = row
         return cls(id, text, Time(*time), data)
-
-
-@dataclass(frozen=True)
-class Step(Record):
-    """A step that waits to become notes: when it was, told in full, and in one line; each within a budget."""
-
-    time: Time
-    text: str
-    line: str
-
-    @classmethod
-    def of(cls, transition: Transition, services: Services, tokens: int) -> Step:
-        """The step of a transition that has just been made; its text and its line have at most `tokens` each."""
-        now = services.time()
-        time = Time(now.episode, transition.step, max(0, now.total - now.step + transition.step))
-        seen = Experience.of(transition)
-        count = services.llm.count_tokens
-        return cls(time, seen.block(tokens, count), clip_text(one_line(seen.line()), tokens, count))
-
-    def row(self) -> list[Any]:
-        return [numbers(self.time), self.text, self.line]
-
-    @classmethod
-    def load(cls, state: Sequence[Any]) -> Step:
-        """What `row` gave."""
-        return cls(Time(*state[0]), state[1], state[2])
 
 
 class Entries:
@@ -256,17 +227,6 @@ def stamp(time: Time, now: Time) -> str:
     return step if time.episode == now.episode else f"episode {time.episode + 1}, {step}"
 
 
-def told(steps: Iterable[Step]) -> str:
-    """Steps one after the other, each under its time."""
-    kept = list(steps)
-    return "\n\n".join(f"[{stamp(s.time, kept[-1].time)}]\n{s.text}" for s in kept)
-
-
-def task_of(instruction: str, tokens: int, services: Services) -> str:
-    """The beginning of the task's instruction on one line."""
-    return clip_text(" ".join(instruction.split()), tokens, services.llm.count_tokens) or "(not told)"
-
-
 def one_line(text: str) -> str:
     """Text without line breaks and runs of blanks."""
     return " ".join(text.split())
@@ -284,25 +244,15 @@ def dated(entry: Entry, now: Time) -> str:
     return f"- {entry.text} [{stamp(entry.time, now)}]"
 
 
-def shown_lines(lines: Sequence[str], most: int) -> list[str]:
-    """The newest lines; those of steps that the prompt tells anyway are left out there (`agentspec.prompting`)."""
-    return list(lines)[-most:] if most else []
-
-
 __all__ = [
     "NOTES",
-    "STEPS",
     "Entries",
     "Entry",
     "NoEmbedder",
-    "Step",
     "dated",
     "embedder_of",
     "numbers",
     "one_line",
     "recalled",
-    "shown_lines",
     "stamp",
-    "task_of",
-    "told",
 ]

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from agentspec.memory.parts.telling import newest_that_fit
 from agentspec.services import Answer, Services, Time
 from agentspec.tokens import CountTokens, clip_text, excerpt
-from agentspec.trajectory import Trajectory
 from agentspec.types import Experience, RecallItem, Transition
 
 FEEDBACK_TOKENS = 64
@@ -90,6 +89,11 @@ def first_held(services: Services, step: int) -> int:
     return max(0, step + 1 - held)
 
 
+def first_told(services: Services) -> int:
+    """The first step of the episode that the conversation of this step's prompt tells; without one, this step."""
+    return services.time().step - services.context.told
+
+
 def written(answer: Answer[str], tokens: int, count_tokens: CountTokens) -> str:
     """What can be kept of an answer in words: of one that was cut off, its whole sentences; at most `tokens`."""
     text = str(answer.value or "").strip()
@@ -97,11 +101,3 @@ def written(answer: Answer[str], tokens: int, count_tokens: CountTokens) -> str:
         end = max(text.rfind(mark) for mark in (". ", ".\n", "! ", "? ", "\n"))
         text = text[: end + 1].strip()
     return clip_text(text, tokens, count_tokens)
-
-
-def outcome(trajectory: Trajectory) -> str:
-    """One line on how the episode ended: steps, return, and whether it was a success where that is known."""
-    steps = trajectory.transitions
-    success = trajectory.metrics.get("success")
-    told = "" if success is None else f", {'a success' if success else 'no success'}"
-    return f"The episode ended after {len(steps)} steps with a return of {sum(t.reward for t in steps):+.2f}{told}."

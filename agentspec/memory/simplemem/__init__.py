@@ -33,20 +33,8 @@ from typing import Any
 
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
-from agentspec.memory.parts.entries import (
-    NOTES,
-    STEPS,
-    Entries,
-    Entry,
-    Step,
-    dated,
-    embedder_of,
-    one_line,
-    recalled,
-    shown_lines,
-    task_of,
-    told,
-)
+from agentspec.memory.parts.entries import NOTES, Entries, Entry, dated, embedder_of, one_line, recalled
+from agentspec.memory.parts.waiting import STEPS, Step, shown_lines, task_of, told, unwritten
 from agentspec.memory.simplemem.names import Named, is_vague, names_in
 from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, Check, Note, Plan, data_of
 from agentspec.parameters import at_least, settings
@@ -122,11 +110,11 @@ class SimpleMemory:
         purposes={
             "compress": Purpose(
                 "store",
-                '{"notes": [{"text": "SUB() takes 1 from the number.", "keywords": ["SUB"], "place": "", '
-                '"entities": ["number"], "topic": "operations"}, {"text": "SUB() takes 1 from the number always.", '
+                '{"notes": [{"text": "SUB() takes 1 from the number.", "keywords": ["rule"], "place": "", '
+                '"entities": ["world"], "topic": "rules"}, {"text": "SUB() takes 1 from the number always.", '
                 '"keywords": [], "place": "", "entities": [], "topic": ""}]}',
             ),
-            "merge": Purpose("store", '{"text": "SUB() takes 1 from every number.", "keywords": ["SUB"]}'),
+            "merge": Purpose("store", '{"text": "SUB() takes 1 from every number.", "keywords": ["rule"]}'),
             "plan": Purpose("retrieve", '{"queries": ["what SUB() does"]}'),
             "check": Purpose("retrieve", '{"enough": false, "queries": ["what the target is"]}'),
         },
@@ -196,8 +184,8 @@ class SimpleMemory:
         self._dropped = 0
 
     def begin_episode(self, task: Task) -> None:
-        self._left = bool(self._new)
         self._window = self._window[-self._new :] if self._new else []
+        self._left = unwritten(self._window)
         self._before, self._lines = [], []
 
     # -- recall ----------------------------------------------------------------------------------------------------
@@ -262,7 +250,7 @@ class SimpleMemory:
         return [(entry.id, (entry, score)) for entry, score in found]
 
     async def _ask(self, purpose: str, static: str, dynamic: str, schema: object) -> Any:
-        parse = json_of(schema, repairs=self.repairs)
+        parse = json_of(schema, repairs=self.repairs, whole=False)
         answer = await self.services.ask(purpose, (system(static), user(dynamic)), self.answer_tokens, parse)
         return answer.value
 
@@ -284,7 +272,10 @@ class SimpleMemory:
             await self._compress()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is left is compressed when the next episode of the run begins."""
+        """What is left is compressed, with the result, when the next episode of the run begins."""
+        if self.services.carried and trajectory.transitions:
+            self._window.append(Step.end(trajectory, self.services))
+            self._new += 1
 
     def novelty(self, text: str, before: list[str]) -> float:
         """How new a text is beside others: 0 (one of them) to 1 (also where there are none)."""
@@ -299,13 +290,14 @@ class SimpleMemory:
 
     async def _compress(self) -> None:
         """One call over the window; what it wrote, and what that brought together."""
-        parse = json_of({"notes": list[Note]}, repairs=self.repairs)
+        parse = json_of({"notes": list[Note]}, repairs=self.repairs, whole=False)
         answer = await self.services.ask("compress", self._compression(), self.answer_tokens, parse)
         at = self._window[-1].time
         if answer.value is None:
             self._new = 0
             return
-        self._window, self._new = self._window[-self.overlap :] if self.overlap else [], 0
+        again = [step for step in self._window if not step.ends][-self.overlap :] if self.overlap else []
+        self._window, self._new = again, 0
         added = []
         for note in answer.value["notes"][: self.max_notes]:
             text = one_line(note.text)
