@@ -15,10 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
-import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -36,44 +33,6 @@ AGENTS: dict[str, dict[str, Any]] = {
         "sampling": {"max_tokens": 16},
     },
 }
-
-
-class Growth:
-    """Largest growth of the process's resident memory inside a ``with`` block, in MiB."""
-
-    def __enter__(self) -> Growth:
-        self._start, self._stop = rss_mb(), threading.Event()
-        self.peak_mb = 0.0
-        self._thread = threading.Thread(target=self._poll, daemon=True)
-        self._thread.start()
-        return self
-
-    def _poll(self) -> None:
-        while not self._stop.wait(0.005):
-            self.peak_mb = max(self.peak_mb, rss_mb() - self._start)
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        self.peak_mb = max(self.peak_mb, rss_mb() - self._start)
-
-
-def rss_mb() -> float:
-    """Resident memory of this process in MiB."""
-    if sys.platform != "linux":
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
-
-
-def release() -> None:
-    """Give freed memory back to the system, so that the next growth is its own."""
-    import ctypes
-    import gc
-
-    gc.collect()
-    if sys.platform == "linux":
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def script(request: Any) -> str:
@@ -115,6 +74,7 @@ def measure(
     from agentspec.spec import AgentSpec
     from agentspec.types import Task
     from benchmarks.market import MARKET
+    from benchmarks.measuring import PeakMemory, release
 
     world = {"steps": turns, "words": options.words, "menu": bool(options.model)}
     runner = Runner(AgentSpec.from_data(AGENTS[agent]), llm)
@@ -123,7 +83,7 @@ def measure(
         if options.model:
             llm.invalidate()
         release()
-        with Growth() as growth:
+        with PeakMemory() as growth:
             clock = time.perf_counter if options.model else time.process_time
             start = clock()
             (episode,) = runner.run([Job(Task(MARKET, seed, world))])

@@ -9,6 +9,12 @@ is ``GRPOTrainer`` with ``environment_factory``, whose parser sees a tool call i
 the environments' steps (for TRL ``_generate``, without making and resetting its environments); A B A B in one process,
 the median is reported. TRL's last tool call is not executed: it steps its environments once less.
 
+``utilisation`` is how much of the machine our side used while it read prompts (prefill) and while it wrote (decode):
+the least time of the same forwards at the ceilings measured in the same run, over the processor time they took,
+sampling included (`benchmarks.phases`). With ``--json`` every number of turns has ``ours_s``, ``trl_s`` and ``ratio``
+(medians), ``tokens`` and ``trl_tokens`` (of all conversations), and ``prefill`` and ``decode``, each with ``forwards``,
+``tokens``, ``seconds``, ``tokens_per_s``, ``cpu_s`` (per thread; all repeats together) and ``utilisation``.
+
 ``slow_env_ratio`` compares 32 rollouts in environments that take 0.1 s a call. There the model is a tiny random one
 and answers two tokens, so that environments are what is measured, and TRL makes as many calls as ours (and one more
 answer).
@@ -28,6 +34,8 @@ from dataclasses import replace
 from typing import Any
 
 from agentspec.llm.local import LocalLLM
+from benchmarks.measuring import ceilings
+from benchmarks.phases import Phases
 
 CHATML = (
     "{% for m in messages %}<|im_start|>{{ m['role'] }}\n{{ m['content'] }}"
@@ -72,8 +80,8 @@ def market_tasks(rollouts: int, options: dict[str, Any]) -> list[tuple[Any, int]
 
 def our_rollouts(
     model: Any, tokenizer: Any, rollouts: int, options: dict[str, Any], answer: int
-) -> Callable[[], tuple[float, int]]:
-    """A function that plays all episodes from an empty cache: seconds, and tokens of all conversations."""
+) -> tuple[Callable[[], tuple[float, int]], Phases]:
+    """A function that plays all episodes from an empty cache (seconds, tokens of all conversations), and its phases."""
     from agentspec.episode import Job, Runner
 
     llm = FixedLengthLLM(model, tokenizer, answer)
@@ -81,6 +89,7 @@ def our_rollouts(
     runner = Runner(agent_spec(), llm)
     # The backend checks its own arithmetic once, before the first batch.
     runner.run([Job(market_tasks(1, {**options, "steps": 1, "delay_s": 0.0})[0][0])])
+    phases = Phases(llm)
 
     def play() -> tuple[float, int]:
         model.eval()
@@ -93,7 +102,7 @@ def our_rollouts(
             raise RuntimeError(f"an episode did not take {options['steps']} turns: {problems[0]}")
         return seconds, sum(len(t.calls[-1].prompt_ids) + answer for t in episodes)
 
-    return play
+    return play, phases
 
 
 def system_text(options: dict[str, Any]) -> str:
@@ -237,16 +246,16 @@ def compare(
 def run_turns(model: Any, tokenizer: Any, turns: int, options: argparse.Namespace) -> dict[str, Any]:
     """One number of turns."""
     world = {"steps": turns, "words": options.words}
-    ours = our_rollouts(model, tokenizer, options.rollouts, world, options.answer)
+    ours, phases = our_rollouts(model, tokenizer, options.rollouts, world, options.answer)
     trl = trl_rollouts(model, tokenizer, options.rollouts, world, options.answer, turns - 1)
-    return compare(ours, trl, options.repeats)
+    return compare(ours, trl, options.repeats) | phases.summary(ceilings(model.device))
 
 
 def run_slow(options: argparse.Namespace) -> dict[str, Any]:
     """Environments that take 0.1 s a call."""
     model, tokenizer = tiny()
     world = {"steps": options.slow_turns, "words": 2, "delay_s": 0.1}
-    ours = our_rollouts(model, tokenizer, options.slow_rollouts, world, 2)
+    ours, _ = our_rollouts(model, tokenizer, options.slow_rollouts, world, 2)
     trl = trl_rollouts(model, tokenizer, options.slow_rollouts, world, 2, options.slow_turns)
     return compare(ours, trl, options.repeats)
 
@@ -277,8 +286,14 @@ def main() -> None:
         what = name if name.startswith("slow") else f"{name} turns"
         print(
             f"{what:<18} ours {r['ours_s']:7.2f} s  trl {r['trl_s']:7.2f} s  ratio {r['ratio']:6.2f}x  "
-            f"{r['tokens']} tokens (trl {r['trl_tokens']})"
+            f"{r['tokens']} tokens (trl {r['trl_tokens']}){_used(r)}"
         )
+
+
+def _used(result: dict[str, Any]) -> str:
+    """Speed and utilisation of each phase."""
+    parts = [(name, result[name]) for name in ("prefill", "decode") if name in result]
+    return "".join(f"  {n} {p['tokens_per_s']:.0f} tokens/s, utilisation {p['utilisation']:.0%}" for n, p in parts)
 
 
 if __name__ == "__main__":

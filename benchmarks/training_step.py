@@ -1,14 +1,13 @@
 """One update on the same rows: prefix-tree packing beside stock TRL's padded rows.
 
-    python -m benchmarks.training_step [--json] [--rollouts 4] [--turns 8] [--repeats 3] [--adapter NAME]
+    python -m benchmarks.training_step [--json] [--rollouts 4] [--turns 8] [--repeats 1] [--adapter NAME] [--reference]
 
 Rows have the shape of real episodes in three layouts (token counts of the quick-start: a static prompt, then an
 observation and an action per turn): ``conversation`` is one row per episode, ``snapshot`` one per step, ``supo`` one
 per summary segment. Both sides see the same tokens, masks and advantages and the same LoRA policy; they run in turn,
 A B A B, in one process, and the median is reported. Stock TRL gets its own batches: prompts padded left, completions
-padded right, the rows of a micro-batch as they come. ``rel_grad_diff`` is the relative difference of the gradient,
-``max_rel_grad_diff`` the largest of any parameter's: where a gradient is small by cancellation, float32 rounds off more
-of it, on either side.
+padded right, the rows of a micro-batch as they come. ``rel_grad_diff`` and ``max_rel_grad_diff`` compare the gradients:
+what they mean, and what ``--reference`` adds, is told in `benchmarks.gradient_error`.
 
 The policy is the quick-start's: LoRA on the upper 12 of 30 layers. ``ours`` starts above the frozen ones, from what the
 local backend left of them while it sampled, as training does; ``alone`` has to compute that itself. ``cpu_ratio``
@@ -21,9 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import random
-import resource
 import statistics
 import sys
 import tempfile
@@ -33,7 +30,10 @@ from typing import Any
 
 import torch
 
-LAYOUTS = {"conversation": 8, "snapshot": 8, "supo": 16}
+from benchmarks.gradient_error import Gradients, differences, errors, gradients, in_float64
+from benchmarks.measuring import PeakMemory, ceilings, clock, release
+
+LAYOUTS = {"conversation": 8, "snapshot": 6, "supo": 16}
 """Layout -> turns of an episode: SUPO's are long enough for two segments."""
 STATIC, OBSERVATION, ANSWER, SUMMARY, SEGMENT = 300, 120, 8, 60, 8
 
@@ -184,33 +184,14 @@ def trainers_for(model_name: str, adapter: str) -> tuple[Any, Any]:
     return built[0], built[1]
 
 
-def gradients(trainer: Any) -> dict[str, torch.Tensor]:
-    """Gradients of the last update, cleared for the next."""
-    named = {n: p.grad.clone() for n, p in trainer.model.named_parameters() if p.grad is not None}
-    trainer.model.zero_grad(set_to_none=True)
-    return named
-
-
 def measure(run: Callable[[], None]) -> dict[str, float]:
-    """Seconds, of processor time too (per thread), and peak additional memory (MB) of one call."""
-    with PeakMemory() as memory:
-        start, used = time.perf_counter(), time.process_time()
+    """Seconds, of processor time too (per thread), and peak additional memory (MiB) of one call."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    with PeakMemory(device.type == "cuda") as memory:
+        used, start = clock(device), time.perf_counter()
         run()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        seconds, used = time.perf_counter() - start, time.process_time() - used
-    cpu = seconds if torch.cuda.is_available() else used / torch.get_num_threads()
-    return {"s": seconds, "cpu_s": cpu, "mb": memory.peak_mb}
-
-
-def ceilings(device: torch.device) -> tuple[float, float]:
-    """FLOP/s of a large product of matrices, bytes/s of a copy (read and written): the best of five of each."""
-    a, b = torch.randn(2048, 576, device=device), torch.randn(576, 1536, device=device)
-    x = torch.randn(1 << 24, device=device)
-    y = torch.empty_like(x)
-    product = min(measure(lambda: torch.mm(a, b))["cpu_s"] for _ in range(5))
-    copy = min(measure(lambda: y.copy_(x))["cpu_s"] for _ in range(5))
-    return 2 * a.shape[0] * a.shape[1] * b.shape[1] / product, 8 * x.numel() / copy
+        used, seconds = clock(device) - used, time.perf_counter() - start
+    return {"s": seconds, "cpu_s": used, "mb": memory.peak_mb}
 
 
 def floor(update: Callable[[], None], logits: int, device: torch.device) -> float:
@@ -222,70 +203,34 @@ def floor(update: Callable[[], None], logits: int, device: torch.device) -> floa
 
     with FlopCounterMode(display=False, custom_mapping={torch.ops.mkldnn._linear_pointwise: packed_linear}) as counter:
         update()
-    flops, copied = ceilings(device)
-    return counter.get_total_flops() / flops + 4 * 4 * logits / copied
+    best = ceilings(device)
+    return counter.get_total_flops() / best.flops + 4 * 4 * logits / best.copied
 
 
-class PeakMemory:
-    """Peak memory above the start: CUDA's own counter, or the resident set polled every 5 ms."""
-
-    def __enter__(self) -> PeakMemory:
-        import threading
-
-        self.peak_mb = 0.0
-        if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()
-            self._start = torch.cuda.memory_allocated() / 2**20
-            return self
-        self._start = _rss_mb()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._poll, daemon=True)
-        self._thread.start()
-        return self
-
-    def _poll(self) -> None:
-        while not self._stop.wait(0.005):
-            self.peak_mb = max(self.peak_mb, _rss_mb() - self._start)
-
-    def __exit__(self, *_: object) -> None:
-        if torch.cuda.is_available():
-            self.peak_mb = torch.cuda.max_memory_allocated() / 2**20 - self._start
-            return
-        self._stop.set()
-        self._thread.join()
-        self.peak_mb = max(self.peak_mb, _rss_mb() - self._start)
-
-
-def _rss_mb() -> float:
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
-
-
-def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) -> dict[str, float]:
-    """Both sides in turn on one layout."""
+def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) -> dict[str, Any]:
+    """All sides in turn on one layout."""
     from trainers.tree.trie import build_tree
 
     vocabulary = int(ours.model.get_input_embeddings().weight.shape[0])
     rows = make_rows(layout, options.rollouts, options.turns or LAYOUTS[layout], vocabulary)
     theirs, mine = stock_update(stock, rows, options.micro), our_update(ours, rows, options.ours_micro)
     alone = ours.llm and ours._recorder is not None
-    sides = [("trl", stock, theirs), ("ours", ours, mine), *([("alone", ours, mine)] if alone else [])]
+    sides = [("trl", stock, theirs), *([("alone", ours, mine)] if alone else []), ("ours", ours, mine)]
     measured: dict[str, list[dict[str, float]]] = {name: [] for name, *_ in sides}
-    grads: dict[str, dict[str, torch.Tensor]] = {}
+    grads: dict[str, Gradients] = {}
     for _ in range(options.repeats):
         for name, trainer, update in sides:
             if name == "ours":
                 read_by_rollouts(ours, rows)
             elif name == "alone":
                 ours._recorder.clear()
-            _release()
+            release()
             measured[name].append(measure(update))
             grads[name] = gradients(trainer)
-    read_by_rollouts(ours, rows)
     trained = sum(r.sequence.trained for r in rows)
-    least = floor(mine, trained * vocabulary, next(ours.model.parameters()).device)
+    least = floor(mine, trained * vocabulary, next(ours.model.parameters()).device)  # what was read is still there
     gradients(ours)
-    result: dict[str, float] = {
+    result: dict[str, Any] = {
         f"{name}_{key}": statistics.median(m[key] for m in runs)
         for name, runs in measured.items()
         for key in ("s", "cpu_s", "mb")
@@ -296,30 +241,11 @@ def run_layout(layout: str, stock: Any, ours: Any, options: argparse.Namespace) 
         "alone_cpu_ratio": result["trl_cpu_s"] / result["alone_cpu_s" if alone else "ours_cpu_s"],
         "memory_ratio": result["trl_mb"] / max(1.0, result["ours_mb"]),
         "utilisation": least / result["ours_cpu_s"],
-        **_differences(grads["trl"], [g for name, g in grads.items() if name != "trl"]),
+        **max((differences(g, grads["trl"]) for n, g in grads.items() if n != "trl"), key=lambda d: d["rel_grad_diff"]),
+        **(errors(grads, in_float64(stock, stock_update(stock, rows, 1))) if options.reference else {}),
         "packing_ratio": sum(len(r.sequence) for r in rows) / len(build_tree([r.sequence.tokens for r in rows]).tokens),
         "rows": len(rows),
     }
-
-
-def _differences(trl: dict[str, torch.Tensor], others: list[dict[str, torch.Tensor]]) -> dict[str, float]:
-    """Largest relative difference of a parameter's gradient, and of the whole gradient."""
-    apart = [{n: float((other[n] - g).norm()) for n, g in trl.items()} for other in others]
-    norms = {n: float(g.norm()) for n, g in trl.items()}
-    return {
-        "max_rel_grad_diff": max(d / norms[n] for of in apart for n, d in of.items() if norms[n] > 0),
-        "rel_grad_diff": max(math.hypot(*of.values()) for of in apart) / math.hypot(*norms.values()),
-    }
-
-
-def _release() -> None:
-    """Give freed memory back to the system, so that the next peak is its own."""
-    import ctypes
-    import gc
-
-    gc.collect()
-    if sys.platform == "linux":
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def main() -> None:
@@ -328,8 +254,9 @@ def main() -> None:
     parser.add_argument("--model", default="smollm2-135m")
     parser.add_argument("--adapter", default="smollm2-135m-courier", help="empty: a new one, on all layers")
     parser.add_argument("--rollouts", type=int, default=4, help="8 and 12 turns take stock TRL more than 24 GB")
-    parser.add_argument("--turns", type=int, help="of every layout (default: 8, supo 16)")
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--turns", type=int, help="of every layout (default: 8, snapshot 6, supo 16)")
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--reference", action="store_true", help="gradients of both sides beside those in float64")
     parser.add_argument("--micro", type=int, default=4, help="rows per micro-batch of stock TRL")
     parser.add_argument("--ours-micro", type=int, default=2, help="micro-batches of our update")
     parser.add_argument("--layouts", nargs="*", default=list(LAYOUTS))
@@ -344,12 +271,20 @@ def main() -> None:
             f"(processor time {r['cpu_ratio']:.2f}x, alone {r['alone_cpu_ratio']:.2f}x)  "
             f"utilisation {r['utilisation']:.0%}  memory {r['memory_ratio']:.2f}x  "
             f"gradient difference {r['rel_grad_diff']:.1e} (of a parameter at most {r['max_rel_grad_diff']:.1e})  "
-            f"packing {r['packing_ratio']:.2f}",
+            f"packing {r['packing_ratio']:.2f}{_told(r)}",
             file=sys.stderr if options.json else sys.stdout,
             flush=True,
         )
     if options.json:
         print(json.dumps(results))
+
+
+def _told(r: dict[str, Any]) -> str:
+    """How far both sides are from the gradient in float64, if that was computed."""
+    if "trl_error" not in r:
+        return ""
+    ours, trl = (f"{r[f'{s}_error']:.1e} (of a parameter at most {r[f'{s}_max_error']:.1e})" for s in ("ours", "trl"))
+    return f"  from float64: ours {ours}, trl {trl}"
 
 
 if __name__ == "__main__":
