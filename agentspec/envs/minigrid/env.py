@@ -346,7 +346,7 @@ class MiniGridEnv(gymnasium.Env[dict[str, Any], str]):
         return {} if best is None else {"efficiency": best / max(steps, best), "optimal_steps": float(best)}
 
 
-def _choice(suite: str | None, level: str | None, task: str | None) -> dict[str, str]:
+def _choice(suite: str | None, level: str | None, task: str | None) -> dict[str, Any]:
     """What is played, of the three that may be given: the suite `paper` if none is."""
     given = {"suite": suite or "", "level": level or "", "task": task or ""}
     return given if any(given.values()) else {**given, "suite": "paper"}
