@@ -76,7 +76,8 @@ def weighted_runs(
 
     With `LEAST_RUNS` runs of each: the runs of a recipe are an independent sample with a variance of its own; t
     interval and test with Satterthwaite's degrees of freedom (of two samples Welch's, of one Student's). Otherwise over
-    seeds, and the note says `this checkpoint only`.
+    seeds, and the note says `this checkpoint only`; so too where runs do not differ at all: a few runs with the same
+    share of tasks passed are chance, and say nothing of how runs vary.
 
     Args:
         samples: weight and runs of each recipe.
@@ -87,16 +88,15 @@ def weighted_runs(
     if min(len(runs) for _, runs in samples) >= LEAST_RUNS:
         if not common:
             return Estimate(math.nan, math.nan, math.nan, 0, "run", note="no task that all runs have")
-        return _satterthwaite([(weight, [_mean(run, common) for run in runs]) for weight, runs in samples], level)
+        found = _satterthwaite([(weight, [_mean(run, common) for run in runs]) for weight, runs in samples], level)
+        if found is not None:
+            return found
     means = [(weight, {k: math.fsum(run[k] for run in runs) / len(runs) for k in common}) for weight, runs in samples]
     return over_tasks([math.fsum(weight * of[key] for weight, of in means) for key in common], level=level, seed=seed)
 
 
-def _satterthwaite(samples: Sequence[tuple[float, Values]], level: float) -> Estimate:
-    """A weighted sum of the means of independent samples.
-
-    Where no sample varies beyond float noise there is nothing to test: `p` is 1 for 0, else 0.
-    """
+def _satterthwaite(samples: Sequence[tuple[float, Values]], level: float) -> Estimate | None:
+    """A weighted sum of the means of independent samples; `None` where it is not 0 and no sample varies beyond noise."""
     from scipy import stats
 
     weighted = [(weight, finite(values, level)) for weight, values in samples]
@@ -104,7 +104,7 @@ def _satterthwaite(samples: Sequence[tuple[float, Values]], level: float) -> Est
     count = sum(x.size for _, x in weighted)
     noise = 1e-12 * max(1.0, *(float(np.abs(x).max()) for _, x in weighted))
     if all(np.ptp(x) <= noise for _, x in weighted):
-        return Estimate(mean, mean, mean, count, "run", float(abs(mean) <= noise))
+        return Estimate(mean, mean, mean, count, "run", 1.0) if abs(mean) <= noise else None
     parts = [weight**2 * float(x.var(ddof=1)) / x.size for weight, x in weighted]
     freedom = sum(parts) ** 2 / sum(part**2 / (x.size - 1) for part, (_, x) in zip(parts, weighted, strict=True))
     error = math.sqrt(sum(parts))

@@ -143,9 +143,14 @@ def test_too_few_runs_speak_of_themselves():
 
 
 def test_runs_without_any_spread():
-    same = [{0: 1.0}] * 3
-    assert compare_runs(same, same).p == 1.0 and compare_runs(same, [{0: 0.0}] * 3).p == 0.0
-    assert compare_runs(same, [{0: 0.0}], fixed=True).p == 0.0
+    """Runs that pass equally many tasks are a chance of few tasks: not certainty, but what the tasks say."""
+    ones, zeros = [dict.fromkeys(range(8), 1.0)] * 3, [dict.fromkeys(range(8), 0.0)] * 3
+    assert compare_runs(ones, ones).p == 1.0
+    for found in (compare_runs(ones, zeros), compare_runs(ones, zeros[:1], fixed=True)):
+        assert (found.n, found.note) == (8, "this checkpoint only") and found.p == pytest.approx(2 / 2**8)
+    shifted = [{k: float(k == run) for k in range(8)} for run in range(3)]  # each passes another task: all 1 of 8
+    found = compare_runs(shifted, zeros[:1], fixed=True)
+    assert found.mean == pytest.approx(1 / 8) and found.p > 0.05
 
 
 def test_runs_that_are_equal_up_to_float_noise_are_a_tie() -> None:
