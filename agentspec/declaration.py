@@ -45,11 +45,14 @@ class Purpose:
             with its form: texts of several words are replaced by what the expert notes, single words and numbers stay
             (`agentspec.reworded`); so let single words be good ones in any world.
         literal: the example is as good an answer in any world, word for word (a query).
+        refers: field that names something the prompt shows (by number or id), about which an expert knows nothing: of a
+            list it answers with, items that have one are left out.
     """
 
     occasion: Occasion
     example: str = ""
     literal: bool = False
+    refers: str = ""
 
     @classmethod
     def each(cls, occasion: Occasion, *names: str) -> dict[str, Purpose]:

@@ -26,7 +26,7 @@ from agentspec.importing import import_name
 from agentspec.llm.base import LLMError, Request
 from agentspec.llm.demonstration import DemonstrationLLM
 from agentspec.registry import REGISTRY, SpecError
-from agentspec.reworded import reworded
+from agentspec.reworded import reworded, without
 from agentspec.spec import AgentSpec, ModuleSpec
 from agentspec.tokens import CountTokens, clip_text
 from agentspec.trajectory import Trajectory
@@ -111,7 +111,7 @@ class Words:
         purpose, asked = self.purposes[tag.purpose], request.messages[-1].text
         if purpose.literal:
             return purpose.example
-        example = purpose.example
+        example = without(purpose.example, purpose.refers)
         notes = [*notes_of(played.task, seen)[: MOST - 1], *ahead]
         for most in range(len(notes), 0, -1):
             text = reworded(example, notes[:most], asked)

@@ -35,6 +35,23 @@ def reworded(example: str, sentences: Sequence[str], request: str = "") -> str:
     return json.dumps(_filled(data, _shares(sentences, _places(data))), ensure_ascii=False)
 
 
+def without(example: str, field: str) -> str:
+    """The example without the items of its lists that have a value in `field`.
+
+    >>> without('{"edits": [{"id": 0, "text": "a b"}, {"id": null, "text": "c d"}]}', "id")
+    '{"edits": [{"id": null, "text": "c d"}]}'
+    """
+    return json.dumps(_kept(json.loads(example), field), ensure_ascii=False) if field else example
+
+
+def _kept(value: Any, field: str) -> Any:
+    if isinstance(value, dict):
+        return {name: _kept(one, field) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_kept(v, field) for v in value if not (isinstance(v, dict) and v.get(field) is not None)]
+    return value
+
+
 def _text(lines: list[str], sentences: Sequence[str], request: str) -> str:
     listed = [i for i, line in enumerate(lines) if line.startswith("- ")]
     if listed:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.parts.entries import NOTES, Entries, Entry, dated, embedder_of, one_line, recalled
-from agentspec.memory.parts.waiting import STEPS, Step, shown_lines, task_of, told, unwritten
+from agentspec.memory.parts.waiting import STEPS, Step, result, shown_lines, task_of, told, unwritten
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.services import Services, Time
 from agentspec.state import dump_state, joined, load_state
@@ -155,6 +155,7 @@ class Mem0Memory:
                 "store",
                 '{"operations": [{"op": "UPDATE", "id": 0, "text": "SUB() takes 1 from any number."}, '
                 '{"op": "ADD", "id": null, "text": "DOUBLE() doubles the number."}]}',
+                refers="id",
             ),
             "summary": Purpose("store", "The number grows; the target is far."),
         },
@@ -243,9 +244,13 @@ class Mem0Memory:
                 await self._summarise()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is left is written, with the result, when the next episode of the run begins."""
+        """What is left is written, with the result, when the next episode of the run begins; else the result, now."""
         if self.services.carried and trajectory.transitions:
-            self._pending.append(Step.end(trajectory, self.services))
+            end = Step.end(trajectory, self.services)
+            if unwritten(self._pending):
+                self._pending.append(end)
+            else:
+                self._add(result(end), end.time)
 
     # -- writing ---------------------------------------------------------------------------------------------------
 

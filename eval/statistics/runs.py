@@ -96,7 +96,7 @@ def weighted_runs(
 
 
 def _satterthwaite(samples: Sequence[tuple[float, Values]], level: float) -> Estimate | None:
-    """A weighted sum of the means of independent samples; `None` where it is not 0 and no sample varies beyond noise."""
+    """A weighted sum of the means of independent samples; `None` where it is not 0 and no sample varies."""
     from scipy import stats
 
     weighted = [(weight, finite(values, level)) for weight, values in samples]

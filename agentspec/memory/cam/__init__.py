@@ -202,6 +202,8 @@ class CamMemory:
         """Prune and grow: the model picks among candidates, and these lead to the next ones."""
         similar = {node.id: score for node, score in self.nodes.near(state, self.seeds, where=self._where)}
         candidates = list(similar)
+        if not candidates:
+            return []
         picked: dict[int, None] = {}
         seen = dict.fromkeys(candidates)
         for number in range(self.rounds):

@@ -41,7 +41,7 @@ from agentspec.llm.base import ContextOverflowError, Message, system, user
 from agentspec.llm.recorder import BudgetExceededError
 from agentspec.memory.lightmem.compression import WordCounts, boundaries, keep_surprising, pieces
 from agentspec.memory.parts.entries import Entries, Entry, dated, embedder_of, one_line, recalled, stamp
-from agentspec.memory.parts.waiting import STEPS, Step, concluding, shown_lines, task_of, unwritten
+from agentspec.memory.parts.waiting import STEPS, Step, concluding, result, shown_lines, task_of, unwritten
 from agentspec.parameters import at_least, one_of, settings
 from agentspec.registry import SpecError
 from agentspec.services import Services
@@ -243,7 +243,13 @@ class LightMemory:
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is in the buffers becomes facts, with the result, in the sleep before the next episode of the run."""
         if self.services.carried and trajectory.transitions:
-            self.sensory.append(Step.end(trajectory, self.services))
+            end = Step.end(trajectory, self.services)
+            if self.topics or unwritten(self.sensory):
+                self.sensory.append(end)
+            else:
+                self._topic += 1
+                data = {"topic": self._topic - 1, "checked": -1}
+                self.entries.put(Entry(self.services.new_id(), result(end), end.time, data))
 
     # -- stages ----------------------------------------------------------------------------------------------------
 

@@ -99,12 +99,22 @@ def outcome(trajectory: Trajectory) -> str:
     figures = [f"Return: {sum(t.reward for t in steps):+.2f}"]
     if success is None:
         values = [(metric, number(metrics.get(metric.name))) for metric in declared(trajectory.task.env)]
-        figures += [f"{m.heading}: {round(v, m.digits):g}" for m, v in values if v is not None]
+        figures += [f"{m.heading}: {figure(v, m.digits)}" for m, v in values if v is not None]
     else:
         figures.append("a success" if success else "a failure")
     cut = metrics.get("ended", "environment") != "environment" or (steps and steps[-1].truncated)
     ended = "was cut off" if cut and not success else "ended"
     return OUTCOME.format(ended=ended, steps=len(steps), figures=", ".join(figures))
+
+
+def figure(value: float, digits: int) -> str:
+    """A number with at most so many digits behind its point, all in front of it.
+
+    >>> figure(1234567.8, 2), figure(-3.0, 2)
+    ('1234567.8', '-3')
+    """
+    text = f"{value:.{digits}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def when(episode: int, now: int) -> str:

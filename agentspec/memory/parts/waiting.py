@@ -3,7 +3,7 @@
 A memory that asks the model about several steps holds them as `Step`s until they are notes; what is left over at an
 episode's end is asked about when the next episode of the run begins, so that no call is made that no action can profit
 from, and what is asked is paid for by the episode that reads it. How the episode ended is told with what is left over;
-where nothing is, it waits for the steps that come next, and no call is made for it alone.
+where nothing is, it becomes a note as it is (`result`), and no call is made for it alone.
 """
 
 from __future__ import annotations
@@ -76,6 +76,11 @@ def concluding(steps: Iterable[Step]) -> list[str]:
     return [CONCLUDE] if any(s.ends for s in steps) else []
 
 
+def result(end: Step) -> str:
+    """How an episode ended, where it stands by itself: no step that led to it waits any more."""
+    return f"Episode {end.time.episode + 1}: {end.text}"
+
+
 def unwritten(steps: Iterable[Step]) -> bool:
     """Whether there are steps to make notes of; how an episode ended is none by itself."""
     return any(not s.ends for s in steps)
@@ -91,4 +96,4 @@ def shown_lines(lines: Sequence[str], most: int) -> list[str]:
     return list(lines)[-most:] if most else []
 
 
-__all__ = ["CONCLUDE", "STEPS", "Step", "concluding", "shown_lines", "task_of", "told", "unwritten"]
+__all__ = ["CONCLUDE", "STEPS", "Step", "concluding", "result", "shown_lines", "task_of", "told", "unwritten"]

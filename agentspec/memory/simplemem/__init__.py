@@ -34,7 +34,7 @@ from typing import Any
 from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import Message, system, user
 from agentspec.memory.parts.entries import NOTES, Entries, Entry, dated, embedder_of, one_line, recalled
-from agentspec.memory.parts.waiting import STEPS, Step, shown_lines, task_of, told, unwritten
+from agentspec.memory.parts.waiting import STEPS, Step, result, shown_lines, task_of, told, unwritten
 from agentspec.memory.simplemem.names import Named, is_vague, names_in
 from agentspec.memory.simplemem.prompts import CHECK, COMPRESS, MERGE, PLAN, SEEN, Check, Note, Plan, data_of
 from agentspec.parameters import at_least, settings
@@ -272,10 +272,16 @@ class SimpleMemory:
             await self._compress()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        """What is left is compressed, with the result, when the next episode of the run begins."""
+        """What is left is compressed, with the result, when the next episode begins; else the result is a note, now."""
         if self.services.carried and trajectory.transitions:
-            self._window.append(Step.end(trajectory, self.services))
-            self._new += 1
+            end = Step.end(trajectory, self.services)
+            if self._new:
+                self._window.append(end)
+                self._new += 1
+            else:
+                self._put(
+                    Entry(self.services.new_id(), result(end), end.time, {"keywords": [], "names": [], "topic": ""})
+                )
 
     def novelty(self, text: str, before: list[str]) -> float:
         """How new a text is beside others: 0 (one of them) to 1 (also where there are none)."""

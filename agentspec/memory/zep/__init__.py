@@ -38,7 +38,7 @@ from agentspec.declaration import CallProfile, Declaration, Purpose
 from agentspec.llm.base import system, user
 from agentspec.memory.parts.entries import NOTES, embedder_of, one_line, recalled
 from agentspec.memory.parts.steps import written
-from agentspec.memory.parts.waiting import Step, shown_lines, unwritten
+from agentspec.memory.parts.waiting import Step, result, shown_lines, unwritten
 from agentspec.memory.zep.communities import Communities
 from agentspec.memory.zep.observed import put, read_state
 from agentspec.memory.zep.prompts import COMMUNITY
@@ -119,8 +119,8 @@ class ZepMemory:
                 '"fact": "The agent wants the target.", "since": 1}, {"subject": "agent-itself", "relation": "knows", '
                 '"object": "place", "fact": "SUB() takes 1 from the number.", "since": null}]}',
             ),
-            "same": Purpose("store", '{"same": [{"name": "agent-itself", "known": 0}]}'),
-            "resolve": Purpose("store", '{"results": [{"fact": 0, "same": null, "contradicts": [0]}]}'),
+            "same": Purpose("store", '{"same": [{"name": "agent-itself", "known": 0}]}', refers="known"),
+            "resolve": Purpose("store", '{"results": [{"fact": 0, "same": null, "contradicts": [0]}]}', refers="fact"),
             "community": Purpose("episode", "SUB() takes 1 from the number, which is below 1000."),
         },
         needs=("embedder",),
@@ -222,14 +222,13 @@ class ZepMemory:
     async def end_episode(self, trajectory: Trajectory) -> None:
         """What is left is written with the result, and communities are found, when the next episode of the run begins.
 
-        Where no model writes facts, the result is one at once.
+        Where no model writes facts, or nothing is left, the result is one at once.
         """
         if not (self.services.carried and trajectory.transitions):
             return
         end = Step.end(trajectory, self.services)
-        if self.extraction == "state":
-            name = f"episode {end.time.episode + 1}"
-            put(self.graph, [(name, "result", f"{name.capitalize()}: {end.text}")], end.time, self.services)
+        if self.extraction == "state" or not unwritten(self._pending):
+            put(self.graph, [(f"episode {end.time.episode + 1}", "result", result(end))], end.time, self.services)
         else:
             self._pending.append(end)
 
