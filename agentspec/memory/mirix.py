@@ -233,6 +233,9 @@ class Mirix:
     async def end_episode(self, trajectory: Trajectory) -> None:
         if self.services.carried and self._pending:
             await self._flush(outcome(trajectory))
+        elif self.services.carried and trajectory.transitions:  # nothing is left to ask about
+            event = f"Episode {self.services.time().episode + 1}: {outcome(trajectory)}"
+            self._apply("episodic", Edit("insert", fields={"event": event}))
 
     async def _flush(self, ending: str = "") -> None:
         """Route what has gathered, and let each manager make its edit."""

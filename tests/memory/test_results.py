@@ -128,3 +128,22 @@ def test_an_outcome_is_told_in_the_environments_terms() -> None:
         "cut off after 2 steps. Return: +2.50, a failure."
     )
     assert told("minigrid", success=1).startswith("The episode ended after 2 steps. Return: +2.50, a success.")
+
+
+@pytest.mark.parametrize(
+    ("params", "answers"),
+    [
+        ({"name": "memorybank", "every": 3, "writer": "template"}, {}),
+        ({"name": "memgpt", "every": 3}, {"edit": {"calls": []}}),
+        ({"name": "mirix", "every": 3, "routing": "single"}, {"edit_all": {"edits": []}}),
+        ({"name": "openclaw", "every": 3}, {"learn": {"edits": []}, "dream": {"rules": []}}),
+    ],
+    ids=lambda value: value.get("name", ""),
+)
+def test_an_episode_cut_off_after_a_whole_period_leaves_its_result(params: dict[str, Any], answers: Any) -> None:
+    bench = Bench(params, answers, scope="run")
+    three_steps(bench, ended=False)
+    written = [p for p in bench.purposes() if p != "dream"]
+    bench.end(success=True)
+    assert [p for p in bench.purposes() if p != "dream"] == written, "no call for it alone"
+    assert ENDED in bench.memory.snapshot().decode()

@@ -195,8 +195,12 @@ class MemGPT:
             await self._evict()
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        if self.services.carried and len(trajectory.transitions) > self._asked:
-            await self._edit(len(trajectory.transitions), f"\n\n{outcome(trajectory)}")
+        steps = len(trajectory.transitions)
+        if self.services.carried and steps > self._asked:
+            await self._edit(steps, f"\n\n{outcome(trajectory)}")
+        elif self.services.carried and steps:  # nothing is left to ask about
+            text = f"Episode {self.services.time().episode + 1}: {outcome(trajectory)}"
+            self._archive_insert(FunctionCall("archive_insert", text=text))
 
     async def _edit(self, step: int, warning: str) -> None:
         """Ask for function calls; with a heartbeat once more, with what the first ones gave."""

@@ -177,8 +177,11 @@ class MemoryBank:
             await self._close_day(transition.step + 1)
 
     async def end_episode(self, trajectory: Trajectory) -> None:
-        if self.services.carried and len(trajectory.transitions) > self._day_began:
-            await self._close_day(len(trajectory.transitions), outcome(trajectory))
+        steps = len(trajectory.transitions)
+        if self.services.carried and steps > self._day_began:
+            await self._close_day(steps, outcome(trajectory))
+        elif self.services.carried and steps:  # its last day has been summed up: the result stands by itself
+            self._merged.append(self._add("summary", outcome(trajectory), steps - 1))
 
     async def _close_day(self, step: int, ending: str = "") -> None:
         """Write what the day was, forget what has faded, and begin the next one."""

@@ -203,8 +203,11 @@ class OpenClaw:
     async def end_episode(self, trajectory: Trajectory) -> None:
         if not self.services.carried:
             return
-        if len(trajectory.transitions) > self._since:
-            await self._learn(len(trajectory.transitions), outcome(trajectory))
+        steps = len(trajectory.transitions)
+        if steps > self._since:
+            await self._learn(steps, outcome(trajectory))
+        elif steps:  # nothing is left to ask about
+            self._append(outcome(trajectory), steps - 1, note=True)
         await self._dream()
 
     async def _learn(self, step: int, ending: str = "") -> None:
