@@ -87,32 +87,35 @@ def json_of(schema: Any, *, repairs: int = 1, whole: bool = True) -> Parser[Any]
         raise ParseError(problem)
 
     def salvage(text: str) -> tuple[Any, int]:
+        found: list[tuple[Any, int, int]] = []
         for raw in _values(visible(text)[0]):
             with contextlib.suppress(ParseError, RecursionError):
-                return _what_fits(_replace_surrogates(raw) if "\\u" in text else raw, schema)
-        raise ParseError("nothing of it can be used")
+                found.append(_what_fits(_replace_surrogates(raw) if "\\u" in text else raw, schema))
+        if not found:
+            raise ParseError("nothing of it can be used")
+        value, dropped, _ = max(reversed(found), key=lambda one: one[2])  # of several drafts the fullest, then the last
+        return value, dropped
 
     return Parser(read, f"JSON of the form {describe(schema)}", repairs, None if whole else salvage)
 
 
-def _what_fits(raw: Any, schema: Any) -> tuple[Any, int]:
-    """The answer without the items of its lists that do not fit, and how many these are.
+def _what_fits(raw: Any, schema: Any) -> tuple[Any, int, int]:
+    """The answer without the items of its lists that do not fit; how many these are, and how many fit; a null is none.
 
     Raises:
         ParseError: something else does not fit, or no item is left of an answer that is nothing but lists.
     """
     kinds = get_type_hints(schema) if dataclasses.is_dataclass(schema) else dict(schema)
-    given = raw if isinstance(raw, dict) else {}
+    many = [name for name, kind in kinds.items() if get_origin(kind) in (list, tuple)]
+    given = {k: [] if v is None and k in many else v for k, v in raw.items()} if isinstance(raw, dict) else {}
     lists = {
-        name: get_args(kind)[0]
-        for name, kind in kinds.items()
-        if get_origin(kind) in (list, tuple) and isinstance(given.get(name), list)
+        name: get_args(kind)[0] for name, kind in kinds.items() if name in many and isinstance(given.get(name), list)
     }
     kept = {name: [item for item in given[name] if _fits(item, kind)] for name, kind in lists.items()}
     dropped = sum(len(given[name]) - len(items) for name, items in kept.items())
     if not any(kept.values()) and not kinds.keys() - lists.keys():
         raise ParseError("none of its items fits")
-    return check({**given, **kept} if lists else raw, schema), dropped
+    return check({**given, **kept} if lists else raw, schema), dropped, sum(map(len, kept.values()))
 
 
 def _fits(item: Any, kind: Any) -> bool:

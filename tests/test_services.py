@@ -268,3 +268,12 @@ def test_other_fields_outlive_their_lists_and_must_fit_themselves() -> None:
     parse = json_of(Review, repairs=0, whole=False)
     assert ask(services(f'{{"insight": "i", "notes": [{ONE_BAD}]}}'), parse).value == Review("i")
     assert ask(services(f'{{"insight": 3, "notes": [{GOOD}]}}'), parse).value is None
+
+
+def test_of_several_drafts_the_fullest_counts_and_a_null_is_no_item() -> None:
+    parse = json_of({"notes": list[Note]}, repairs=0, whole=False)
+    draft, final = TWO % f"{GOOD}, {ONE_BAD}", TWO % f'{GOOD}, {{"text": "c", "weight": 2.0}}, {ONE_BAD}'
+    assert [n.text for n in ask(services(f"First {draft}, or better {final}"), parse).value["notes"]] == ["a", "c"]
+    both = json_of({"notes": list[Note], "avoid": list[str]}, repairs=0, whole=False)
+    found = ask(services(f'{{"notes": [{GOOD}], "avoid": null}}'), both).value
+    assert found == {"notes": [Note("a", 1.0)], "avoid": []}
