@@ -121,7 +121,9 @@ def test_an_episode_is_measured() -> None:
     assert figures["steps"] == 3 and figures["memory_calls_per_step"] == 0 and figures["malformed_share"] == 0
     assert 0 < figures["bytes_half_way"] <= figures["bytes_at_end"] and figures["input_tokens_per_step"] > 0
     # Every answer of memory is nonsense: two questions every three steps, a share of 1.
-    memory = played(settings_of("summary", steps=9, **given), ScriptedLLM(lambda request: ""))
+    memory = played(
+        settings_of("summary", steps=9, **given), ScriptedLLM(lambda r: answer(r) if r.sampling.choices else "")
+    )
     assert memory["memory_calls_per_step"] > 0 and memory["malformed_share"] == 1.0
     # What the calls are for adds up to the tokens of a step.
     parts = [memory["decision"], *memory["purposes"].values()]
