@@ -221,7 +221,7 @@ def test_parameters() -> None:
 def test_a_fact_seen_long_ago_is_recalled(importance: str, preset: str, layout: str, scope: str) -> None:
     # In the second of two episodes of 20 steps the fact is 40 steps old, the oldest of all: its recency is scaled to 0.
     # With equal weights of recency and relevance the newest dozen sights come before it, so recency counts less here.
-    # In a conversation what it still tells is left out, and all that is recalled are older sights, each anew at every step.
+    # In a conversation what it still tells is left out: all that is recalled are older sights, anew at every step.
     lasting = (importance, scope) == ("reward", "run") or (layout, scope) == ("conversation", "episode")
     weights = {"weight_recency": 0.2} if lasting else {}
     memory = {"name": "generative", "preset": preset, "importance": importance, **weights}
