@@ -13,6 +13,7 @@ from torch import nn
 
 from agentspec.registry import SpecError
 from trainers.tree.flex import flex_tree, usable
+from trainers.tree.paths import knows, path_attention
 from trainers.tree.trie import Tree
 
 ATTENTION = "agentspec_tree"
@@ -46,7 +47,8 @@ def tree_attention(
     """Attention along each node's path.
 
     `query` (1, heads, N, size), `key` and `value` (1, kv heads, N, size); returns (1, N, heads, size). Without a
-    tree this is transformers' SDPA. With one: node by node on a CPU, one kernel (`trainers.tree.flex`) elsewhere.
+    tree this is transformers' SDPA. With one: node by node on a CPU (`trainers.tree.paths`), one kernel
+    (`trainers.tree.flex`) elsewhere.
     """
     if tree is None:
         from transformers.integrations.sdpa_attention import sdpa_attention_forward
@@ -60,6 +62,8 @@ def tree_attention(
     if usable(query.device, query.dtype):
         mask = tree.block_mask(sliding_window or 0, query.device)
         return flex_tree(query, key, value, mask, scaling).transpose(1, 2), None
+    if knows(query, value):
+        return path_attention(query, key, value, tree, scaling, sliding_window or 0, tree.asked.get(module)), None
     # One split per tensor: its backward is one concatenation, where slices would each allocate a full gradient.
     queries = query.split(tree.lengths, dim=2)
     keys, values = key.split(tree.lengths, dim=2), value.split(tree.lengths, dim=2)

@@ -12,7 +12,7 @@ import torch
 from agentspec.tokens import shared_prefix
 from trainers.tree.flex import block_mask, subtree_ends
 
-NODE_TOKENS = 256
+NODE_TOKENS = 128
 """Longest node: a longer run of tokens becomes a chain of nodes, so that few queries see keys of their future."""
 
 
@@ -29,7 +29,8 @@ class Node:
 class Tree:
     """Sequences packed into a trie.
 
-    `tokens` and `positions` have one entry per unique token; `places[r][p]` is where token p of sequence r is.
+    `tokens` and `positions` have one entry per unique token; `places[r][p]` is where token p of sequence r is. `asked`:
+    places (sorted) at which an attention layer's output is read, for layers where that is not everywhere.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -37,11 +38,24 @@ class Tree:
     nodes: list[Node] = field(default_factory=list)
     places: list[list[int]] = field(default_factory=list)
     masks: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
+    asked: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     @functools.cached_property
     def lengths(self) -> list[int]:
         """Tokens per node."""
         return [n.end - n.start for n in self.nodes]
+
+    @functools.cached_property
+    def spans(self) -> list[list[tuple[int, int]]]:
+        """Per node the places `start .. end` of what its last token sees, in order; what stands in one piece is one."""
+        found: list[list[tuple[int, int]]] = []
+        for node in self.nodes:
+            before = found[node.path[-1]] if node.path else []
+            if before and before[-1][1] == node.start:
+                found.append([*before[:-1], (before[-1][0], node.end)])
+            else:
+                found.append([*before, (node.start, node.end)])
+        return found
 
     def block_mask(self, window: int, device: torch.device) -> Any:
         """FlexAttention's mask, built once per window and update."""
