@@ -1,9 +1,9 @@
 """LoRA layers of an update on a CPU: one product forward and one backward, the adapter merged in.
 
 PEFT multiplies by the base weight W and, beside it, by two thin matrices B A, and adds: four more passes over every
-output. Here both products are with W + s B A, through oneDNN's packed kernels; forward with the very weights that
-sampling multiplied by (`agentspec.llm.local.invariance`), while nothing was written to them. Gradients of A and B
-follow from the input and the output's gradient. Backward the merged weight is formed anew, and not kept.
+output. Here both products are with W + s B A, through oneDNN's packed kernels, as while sampling
+(`agentspec.llm.local.invariance`); gradients of A and B follow from the input and the output's gradient.
+The merged weight is formed again backward, never kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from agentspec.llm.local.invariance import mergeable, packed_weight, packs
+from agentspec.llm.local.invariance import mergeable, packs
 from trainers.frozen import replaced
 
 
@@ -36,8 +36,7 @@ def merged_lora(model: nn.Module) -> Iterator[None]:
 
 def _forward(module: Any, linear: nn.Linear, adapter: str, x: torch.Tensor) -> torch.Tensor:
     a, b = module.lora_A[adapter].weight, module.lora_B[adapter].weight
-    packed = packed_weight(module, linear, (adapter,))
-    out: torch.Tensor = _Merged.apply(x, a, b, packed, linear.weight, linear.bias, module.scaling[adapter])
+    out: torch.Tensor = _Merged.apply(x, a, b, linear.weight, linear.bias, module.scaling[adapter])
     return out
 
 
@@ -45,10 +44,10 @@ class _Merged(torch.autograd.Function):
     """x (..., in) -> x (W + s B A)^T + bias, with gradients of x, A (r, in) and B (out, r)."""
 
     @staticmethod
-    def forward(ctx: Any, x: Any, a: Any, b: Any, packed: Any, weight: Any, bias: Any, scale: float) -> torch.Tensor:
+    def forward(ctx: Any, x: torch.Tensor, a: Any, b: Any, weight: Any, bias: Any, scale: float) -> torch.Tensor:
         ctx.save_for_backward(x, a, b, weight)
         ctx.scale = scale
-        return _product(x, packed, bias)
+        return _product(x, torch.addmm(weight, b, a, alpha=scale), bias)
 
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> Any:
@@ -59,11 +58,11 @@ class _Merged(torch.autograd.Function):
         of_b = ctx.scale * ((a @ rows.t()) @ out).t()
         of_x = None
         if ctx.needs_input_grad[0]:
-            merged = torch.addmm(weight.t(), a.t(), b.t(), alpha=ctx.scale)
-            of_x = _product(gradient, torch.ops.mkldnn._reorder_linear_weight(merged), None)
-        return of_x, of_a, of_b, None, None, None, None
+            of_x = _product(gradient, torch.addmm(weight.t(), a.t(), b.t(), alpha=ctx.scale), None)
+        return of_x, of_a, of_b, None, None, None
 
 
-def _product(x: torch.Tensor, packed: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+def _product(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight)
     out: torch.Tensor = torch.ops.mkldnn._linear_pointwise(x.contiguous(), packed, bias, "none", [], "")
     return out

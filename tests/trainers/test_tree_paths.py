@@ -10,8 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.tiny import tiny_model, tiny_tokenizer
 from tests.trainers.test_tree_flex import SEQUENCES, ends
 from trainers.tree.flex import sees
+from trainers.tree.model import Wanted, enable_tree, packed_inputs
 from trainers.tree.paths import knows, path_attention
 from trainers.tree.trie import Tree, build_tree
 
@@ -88,5 +90,33 @@ def test_spans_are_the_places_of_a_path(sequences: list[list[int]], node_tokens:
 
 def test_what_the_kernel_does_not_compute_is_left_to_others() -> None:
     q, v = torch.zeros(1, 2, 3, 8), torch.zeros(1, 2, 3, 4)
-    assert knows(q, q)
-    assert not knows(q, v) and not knows(q.to("meta"), q.to("meta"))
+    assert knows(q, q, q)
+    assert not knows(q, q, v) and not knows(q, q, q.bfloat16()) and not knows(*[q.to("meta")] * 3)
+
+
+def test_values_that_do_not_lie_in_rows() -> None:
+    tree = build_tree([[1, 2, 3, 4], [1, 2, 5]])
+    inputs = [x.transpose(2, 3).contiguous().transpose(2, 3) for x in drawn(len(tree.tokens))]
+    assert all(x.stride(-1) != 1 for x in inputs)
+    assert torch.allclose(path_attention(*inputs, tree, 0.3, 0), dense(tree, *inputs, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_a_model_reads_its_last_layer_where_it_is_asked(checkpointing: bool) -> None:
+    """Also under autocast, and a tree that was used once may be used again."""
+    model = tiny_model(tiny_tokenizer()).train()
+    enable_tree(model)
+    if checkpointing:
+        model.gradient_checkpointing_enable()
+    pair = [[5, 6, 7, 8, 9], [5, 6, 11, 12]]
+    tree = build_tree(pair)
+    inputs = packed_inputs(tree, torch.device("cpu"))
+    for row, places in ((0, (2, 4)), (1, (3,)), (0, (1,))):
+        before = torch.tensor([tree.places[row][p - 1] for p in places])
+        tokens = torch.tensor([pair[row][p] for p in places])
+        wanted = Wanted(before, tokens, torch.ones(len(places)), (None,) * len(places))
+        plain = model(input_ids=torch.tensor([pair[row]]), use_cache=False).logits[0].log_softmax(-1)
+        expected = plain[[p - 1 for p in places], tokens]
+        assert torch.allclose(model(**inputs, wanted=wanted).log_probs, expected, atol=1e-5)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert torch.allclose(model(**inputs, wanted=wanted).log_probs, expected, atol=0.3)

@@ -42,9 +42,10 @@ def tree_attention(
     scaling: float | None = None,
     sliding_window: int | None = None,
     tree: Tree | None = None,
+    asked: torch.Tensor | None = None,
     **kwargs: Any,
 ) -> tuple[torch.Tensor, None]:
-    """Attention along each node's path.
+    """Attention along each node's path; ``asked``: the places (sorted) where it is read, if not everywhere.
 
     `query` (1, heads, N, size), `key` and `value` (1, kv heads, N, size); returns (1, N, heads, size). Without a
     tree this is transformers' SDPA. With one: node by node on a CPU (`trainers.tree.paths`), one kernel
@@ -62,8 +63,8 @@ def tree_attention(
     if usable(query.device, query.dtype):
         mask = tree.block_mask(sliding_window or 0, query.device)
         return flex_tree(query, key, value, mask, scaling).transpose(1, 2), None
-    if knows(query, value):
-        return path_attention(query, key, value, tree, scaling, sliding_window or 0, tree.asked.get(module)), None
+    if knows(query, key, value):
+        return path_attention(query, key, value, tree, scaling, sliding_window or 0, asked), None
     # One split per tensor: its backward is one concatenation, where slices would each allocate a full gradient.
     queries = query.split(tree.lengths, dim=2)
     keys, values = key.split(tree.lengths, dim=2), value.split(tree.lengths, dim=2)

@@ -68,7 +68,7 @@ def enable_tree(model: nn.Module) -> None:
             return original(*args, **kwargs)
         for name in ("labels", "inputs_embeds", "use_cache"):
             kwargs.pop(name, None)  # wrappers (PEFT) pass these along as None
-        with last_layer_at(self.base_model, wanted.before, tree):
+        with last_layer_at(self.base_model, wanted.before):
             hidden = self.base_model(*args, use_cache=False, tree=tree, **kwargs)
         output: TreeOutput = self.get_output_embeddings()(hidden.last_hidden_state[0][wanted.before], wanted=wanted)
         return output
@@ -79,7 +79,7 @@ def enable_tree(model: nn.Module) -> None:
 
 
 @contextmanager
-def last_layer_at(decoder: Any, places: torch.Tensor, tree: Tree) -> Iterator[None]:
+def last_layer_at(decoder: Any, places: torch.Tensor) -> Iterator[None]:
     """Inside, the last layer computes queries and everything from attention on at `places` of the packed row only.
 
     Nothing is read elsewhere, where zeros stand. Where the layer is recomputed backward, all of it is computed.
@@ -92,8 +92,12 @@ def last_layer_at(decoder: Any, places: torch.Tensor, tree: Tree) -> Iterator[No
     attention, mlp = getattr(last, "self_attn", None), getattr(last, "mlp", None)
     modules = [getattr(attention, "q_proj", None), getattr(attention, "o_proj", None)]
     modules += [mlp] if hasattr(mlp, "down_proj") else []  # of a mixture of experts, all is computed
-    tree.asked = {} if attention is None else {attention: index}
-    with replaced({m: functools.partial(_at, m.forward, index) for m in modules if m is not None}):
+    forwards: dict[nn.Module, Callable[..., Any]] = {
+        m: functools.partial(_at, m.forward, index) for m in modules if m is not None
+    }
+    if attention is not None:
+        forwards[attention] = functools.partial(attention.forward, asked=index)  # reaches `tree_attention`
+    with replaced(forwards):
         yield
 
 

@@ -21,7 +21,7 @@ _LEAST = 32
 
 
 class _Part(NamedTuple):
-    """A node's queries: where they are, what they see, and of that the mask (shares, 1, rows, L)."""
+    """A node's queries: where they are, what they see, and the mask of that, (shares, kv heads, rows, L)."""
 
     rows: Any  # slice or (n,) places
     n: int
@@ -30,10 +30,11 @@ class _Part(NamedTuple):
     mask: torch.Tensor
 
 
-def knows(query: torch.Tensor, value: torch.Tensor) -> bool:
-    """Whether torch's kernel for CPUs computes this attention."""
+def knows(query: torch.Tensor, key: torch.Tensor, value: torch.Tensor) -> bool:
+    """Whether torch's kernel for CPUs computes this attention: heads of one size and type (autocast may mix them)."""
     known = hasattr(torch.ops.aten, "_scaled_dot_product_flash_attention_for_cpu_backward")
-    return known and query.device.type == "cpu" and query.shape[-1] == value.shape[-1] and query.shape[2] > 0
+    alike = query.dtype == key.dtype == value.dtype and query.shape[-1] == value.shape[-1]
+    return known and alike and query.device.type == "cpu" and query.shape[2] > 0
 
 
 def path_attention(
@@ -59,34 +60,31 @@ class _Paths(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, query: Any, key: Any, value: Any, tree: Tree, scaling: Any, window: int, asked: Any) -> Any:
         kernel = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
-        heads, kv_heads = query.shape[1], key.shape[1]
-        out = (torch.empty if asked is None else torch.zeros)(
-            1, query.shape[2], heads, query.shape[3], dtype=query.dtype
-        )
-        parts = list(_parts(tree, heads // kv_heads, kv_heads, window, asked, query))
+        query, key, value = (x if x.stride(-1) == 1 else x.contiguous() for x in (query, key, value))
+        _, heads, count, size = query.shape
+        out = (torch.empty if asked is None else torch.zeros)(1, count, heads, size, dtype=query.dtype)
         sums = []
-        for part in parts:
-            q, (k, v) = _queries(query, part, kv_heads), (_seen(x, part) for x in (key, value))
-            mask = part.mask.expand(-1, kv_heads, -1, -1)
-            attended, logsumexp = kernel(q, k, v, 0.0, False, attn_mask=mask, scale=scaling)
+        for part in _parts(tree, query, key.shape[1], window, asked):
+            q, (k, v) = _queries(query, part, key.shape[1]), (_seen(x, part) for x in (key, value))
+            attended, logsumexp = kernel(q, k, v, 0.0, False, attn_mask=part.mask, scale=scaling)
             out[0, part.rows] = _apart(attended, part)
             sums.append(logsumexp)
         ctx.save_for_backward(query, key, value, out, *sums)
-        ctx.parts, ctx.scaling = parts, scaling
+        ctx.how = tree, scaling, window, asked
         return out
 
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> Any:
         kernel = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward
         query, key, value, out, *sums = ctx.saved_tensors
-        kv_heads = key.shape[1]
+        tree, scaling, window, asked = ctx.how
         of_query, of_key, of_value = (torch.zeros_like(x) for x in (query, key, value))
         gradient, out = (x.transpose(1, 2) for x in (gradient, out))
-        for part, logsumexp in zip(ctx.parts, sums, strict=True):
-            g, q, attended = (_queries(x, part, kv_heads) for x in (gradient, query, out))
+        parts = _parts(tree, query, key.shape[1], window, asked)
+        for part, logsumexp in zip(parts, sums, strict=True):
+            g, q, attended = (_queries(x, part, key.shape[1]) for x in (gradient, query, out))
             k, v = (_seen(x, part) for x in (key, value))
-            mask = part.mask.expand(-1, kv_heads, -1, -1)
-            of_q, of_k, of_v = kernel(g, q, k, v, attended, logsumexp, 0.0, False, attn_mask=mask, scale=ctx.scaling)
+            of_q, of_k, of_v = kernel(g, q, k, v, attended, logsumexp, 0.0, False, attn_mask=part.mask, scale=scaling)
             of_query[0, :, part.rows] = _apart(of_q, part).transpose(0, 1)
             for total, new in ((of_key, of_k), (of_value, of_v)):
                 pieces = new.split([end - start for start, end in part.spans], dim=2)
@@ -96,37 +94,42 @@ class _Paths(torch.autograd.Function):
         return of_query, of_key, of_value, None, None, None, None
 
 
-def _parts(
-    tree: Tree, groups: int, kv_heads: int, window: int, asked: torch.Tensor | None, like: torch.Tensor
-) -> Iterator[_Part]:
-    threads = torch.get_num_threads()
+def _parts(tree: Tree, query: torch.Tensor, kv_heads: int, window: int, asked: torch.Tensor | None) -> Iterator[_Part]:
+    """Per node its queries, or those `asked` of them."""
+    groups, threads = query.shape[1] // kv_heads, torch.get_num_threads()
     even = threads // math.gcd(threads, kv_heads)
+    masks = _masks(tree, groups, window, query.dtype)
     for node, spans in zip(tree.nodes, tree.spans, strict=True):
-        length, n = sum(end - start for start, end in spans), node.end - node.start
+        n = node.end - node.start
         rows: Any = slice(node.start, node.end)
-        mask = _mask(tree, n, length, window, groups, like)
+        mask = masks[:, masks.shape[1] - n :, masks.shape[2] - sum(end - start for start, end in spans) :]
         if asked is not None:
             rows = asked[(asked >= node.start) & (asked < node.end)]
-            mask = mask.unflatten(0, (groups, n))[:, rows - node.start].flatten(0, 1)
-            n = len(rows)
-        shares = even if (groups * n) % even == 0 and groups * n >= _LEAST * even else 1
+            mask, n = mask[:, rows - node.start], len(rows)
         if n:
-            yield _Part(rows, n, spans, shares, mask.unflatten(0, (shares, 1, -1)))
+            shares = even if (groups * n) % even == 0 and groups * n >= _LEAST * even else 1
+            yield _Part(
+                rows, n, spans, shares, mask.flatten(0, 1).unflatten(0, (shares, 1, -1)).expand(-1, kv_heads, -1, -1)
+            )
 
 
-def _mask(tree: Tree, n: int, length: int, window: int, groups: int, like: torch.Tensor) -> torch.Tensor:
-    """Additive mask (groups * n, L) of the last n of L positions: a part of one that all nodes of n tokens share."""
-    key = ("paths", n, window, groups, like.dtype)
+def _masks(tree: Tree, groups: int, window: int, dtype: torch.dtype) -> torch.Tensor:
+    """Additive mask (groups, n, L) of the last n of L positions, for the longest node and path of the tree.
+
+    What a query sees hangs on its distance to the end: that of fewer queries or positions is the last of its rows and
+    columns.
+    """
+    key = ("paths", groups, window, dtype)
     if key not in tree.masks:
-        longest = 1 + max(tree.positions)
+        n, longest = max(tree.lengths), 1 + max(tree.positions)
         here, there = torch.arange(longest - n, longest)[:, None], torch.arange(longest)[None]
         hidden = there > here
         if window:
             hidden |= there <= here - window
-        mask = torch.zeros(n, longest, dtype=like.dtype).masked_fill_(hidden, -torch.inf)
-        tree.masks[key] = mask.repeat(groups, 1)
-    mask = tree.masks[key]
-    return mask[:, mask.shape[1] - length :]
+        mask = torch.zeros(n, longest, dtype=dtype).masked_fill_(hidden, -torch.inf)
+        tree.masks[key] = mask.repeat(groups, 1, 1)
+    masks: torch.Tensor = tree.masks[key]
+    return masks
 
 
 def _queries(x: torch.Tensor, part: _Part, kv_heads: int) -> torch.Tensor:

@@ -29,8 +29,7 @@ class Node:
 class Tree:
     """Sequences packed into a trie.
 
-    `tokens` and `positions` have one entry per unique token; `places[r][p]` is where token p of sequence r is. `asked`:
-    places (sorted) at which an attention layer's output is read, for layers where that is not everywhere.
+    `tokens` and `positions` have one entry per unique token; `places[r][p]` is where token p of sequence r is.
     """
 
     tokens: list[int] = field(default_factory=list)
@@ -38,7 +37,6 @@ class Tree:
     nodes: list[Node] = field(default_factory=list)
     places: list[list[int]] = field(default_factory=list)
     masks: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
-    asked: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     @functools.cached_property
     def lengths(self) -> list[int]:

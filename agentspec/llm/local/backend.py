@@ -3,7 +3,8 @@
 `LocalLLM` turns requests into token rows (`agentspec.llm.chat`), gathers those of all live episodes into one batch
 (`agentspec.llm.batching`) and runs it without padding on cached prefixes (`agentspec.llm.local.engine`). The model is
 never moved, cast or left changed, so a trainer can give the model it optimises; its weights may change between
-batches (the caches notice in-place updates; call `LocalLLM.invalidate` after any other change).
+batches. Call `LocalLLM.invalidate` after a change: the caches notice writes in place only where torch counts them, and
+its fused optimisers (the default of transformers) and writes through `.data` are not counted.
 """
 
 from __future__ import annotations
@@ -199,9 +200,10 @@ class LocalLLM:
         self._batcher.leave(episode)
 
     def invalidate(self) -> None:
-        """Drop all cached keys and values, and packed weights: the weights changed in a way torch does not count.
+        """Drop all cached keys and values, and packed weights: the weights changed.
 
-        Writes in place, as optimisers make them, and another active adapter are noticed without it.
+        Another active adapter, and writes in place that torch counts (not those of fused optimisers), are noticed
+        without it.
         """
         self._engine.invalidate()
 

@@ -47,9 +47,6 @@ class _Packed:
     parts: list[torch.Tensor]
 
 
-_PACKED: WeakKeyDictionary[nn.Module, dict[tuple[str, ...], _Packed]] = WeakKeyDictionary()
-
-
 class InvariantModules:
     """Replaces the forward of a model's linear layers and activation functions, for as long as it is asked to.
 
@@ -59,6 +56,7 @@ class InvariantModules:
 
     def __init__(self, model: nn.Module) -> None:
         self._model = model
+        self._packed: WeakKeyDictionary[nn.Module, dict[tuple[str, ...], _Packed]] = WeakKeyDictionary()
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
@@ -78,9 +76,8 @@ class InvariantModules:
                 del module.forward  # the class's own is seen again
 
     def clear(self) -> None:
-        """Forget the model's packed weights."""
-        for module in self._model.modules():
-            _PACKED.pop(module, None)
+        """Forget all packed weights."""
+        self._packed.clear()
 
     def _replacements(self) -> Iterator[tuple[nn.Module, Callable[..., torch.Tensor]]]:
         inside: set[int] = set()
@@ -90,35 +87,32 @@ class InvariantModules:
             linear, adapters = mergeable(module)
             if linear is not None:
                 inside.update(map(id, module.modules()))
-                yield module, _product(packed_weight(module, linear, adapters), linear.bias)
+                yield module, _product(self._weight(module, linear, adapters), linear.bias)
             elif isinstance(module, _ACTIVATIONS) or type(module).__module__ == "transformers.activations":
                 yield module, _in_whole_vectors(module.forward)
 
-
-def packed_weight(module: Any, linear: nn.Linear, adapters: tuple[str, ...]) -> torch.Tensor:
-    """The packed weight of a layer, as found by `mergeable`: its linear part with adapters added.
-
-    It is kept with the layer, for sampling and for updates, and packed anew if anything in it was written to.
-    """
-    parts = [linear.weight]
-    for name in adapters:
-        parts += [module.lora_A[name].weight, module.lora_B[name].weight]
-    scales = tuple(module.scaling[name] for name in adapters)
-    key = (*((p.data_ptr(), version(p)) for p in parts), *scales)
-    packs = _PACKED.setdefault(module, {})
-    known = packs.get(adapters)
-    if known is None or known.key != key:
-        with torch.no_grad():
+    def _weight(self, module: Any, linear: nn.Linear, adapters: tuple[str, ...]) -> torch.Tensor:
+        """The packed weight of a layer with its active adapters; packed anew if anything in it was written to."""
+        parts = [linear.weight]
+        for name in adapters:
+            parts += [module.lora_A[name].weight, module.lora_B[name].weight]
+        scales = tuple(module.scaling[name] for name in adapters)
+        key = (*((p.data_ptr(), version(p)) for p in parts), *scales)
+        packs = self._packed.setdefault(module, {})
+        known = packs.get(adapters)
+        if known is None or known.key != key:
             weight = linear.weight.detach()
             for name in adapters:
                 weight = weight + module.get_delta_weight(name).detach()
             packed = torch.ops.mkldnn._reorder_linear_weight(weight)
-        known = packs[adapters] = _Packed(packed, key, [p.detach() for p in parts])
-    return known.weight
+            known = packs[adapters] = _Packed(packed, key, [p.detach() for p in parts])
+        return known.weight
 
 
 def version(tensor: torch.Tensor) -> int:
-    """How often a tensor was written to in place; 0 for inference tensors, which do not count."""
+    """How often a tensor was written to in place, as far as torch counts: not for inference tensors, nor what fused
+    optimisers write or goes through `.data`.
+    """
     return 0 if tensor.is_inference() else tensor._version
 
 
