@@ -71,10 +71,11 @@ def measure(
 ) -> dict[str, Any]:
     """Episodes of ``turns`` actions, one after the other: medians over them."""
     from agentspec.episode import Job, Runner
+    from agentspec.llm.local.release import release
     from agentspec.spec import AgentSpec
     from agentspec.types import Task
     from benchmarks.market import MARKET
-    from benchmarks.measuring import PeakMemory, release
+    from benchmarks.measuring import PeakMemory
 
     world = {"steps": turns, "words": options.words, "menu": bool(options.model)}
     runner = Runner(AgentSpec.from_data(AGENTS[agent]), llm)

@@ -6,8 +6,6 @@ machine was used, whatever machine it is.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import resource
 import sys
 import threading
@@ -60,13 +58,6 @@ def rss_mb() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     with open("/proc/self/statm", encoding="ascii") as file:
         return int(file.read().split()[1]) * resource.getpagesize() / 2**20
-
-
-def release() -> None:
-    """Give freed memory back to the system, so that the next growth is its own."""
-    gc.collect()
-    if sys.platform == "linux":
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def clock(device: torch.device) -> float:

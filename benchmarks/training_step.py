@@ -30,8 +30,9 @@ from typing import Any
 
 import torch
 
+from agentspec.llm.local.release import release
 from benchmarks.gradient_error import Gradients, differences, errors, gradients, in_float64
-from benchmarks.measuring import PeakMemory, ceilings, clock, release
+from benchmarks.measuring import PeakMemory, ceilings, clock
 
 LAYOUTS = {"conversation": 8, "snapshot": 6, "supo": 16}
 """Layout -> turns of an episode: SUPO's are long enough for two segments."""

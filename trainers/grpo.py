@@ -195,8 +195,12 @@ class ScaffoldGRPOTrainer(ExactResume, OwnCards, Validation, PolicyLoss, GRPOTra
             with vllm_round(self.vllm_generation, stale=stale):
                 yield
             return
-        getattr(self.llm, "invalidate", lambda: None)()
-        yield
+        invalidate = getattr(self.llm, "invalidate", lambda: None)
+        invalidate()
+        try:
+            yield
+        finally:
+            invalidate()  # the update needs the memory
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""
