@@ -195,12 +195,9 @@ class ScaffoldGRPOTrainer(ExactResume, OwnCards, Validation, PolicyLoss, GRPOTra
             with vllm_round(self.vllm_generation, stale=stale):
                 yield
             return
-        invalidate = getattr(self.llm, "invalidate", lambda: None)
-        invalidate()
-        try:
-            yield
-        finally:
-            invalidate()  # the update needs the memory
+        getattr(self.llm, "invalidate", lambda: None)()
+        yield
+        getattr(self.llm, "give_back", lambda: None)()  # the update needs the memory
 
     def _check_trained(self) -> None:
         """Refuse a generation batch that trains nothing, on all ranks together."""

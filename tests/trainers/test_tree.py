@@ -8,9 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from transformers import BloomConfig, BloomForCausalLM
 
 pytest.importorskip("trl")
 
+from agentspec.registry import SpecError
 from tests.tiny import tiny_model, tiny_tokenizer
 from trainers.forward import rows_logprobs
 from trainers.sequences import Row, TokenSequence
@@ -127,3 +129,9 @@ def test_the_ordinary_forward_is_unchanged() -> None:
     after = model(input_ids=ids, attention_mask=mask).logits
     assert torch.allclose(before[0, :4], after[0, :4]) and torch.allclose(before[1], after[1])
     assert model.generate(ids[1:], max_new_tokens=3, do_sample=False).shape == (1, 8)
+
+
+def test_an_architecture_that_cannot_run_packed_is_refused_with_what_to_do() -> None:
+    config = BloomConfig(vocab_size=64, hidden_size=16, n_layer=1, n_head=2)  # positions by ALiBi, from the mask
+    with pytest.raises(SpecError, match=r"cannot run BloomForCausalLM .* set `packing: padded`"):
+        enable_tree(BloomForCausalLM(config))

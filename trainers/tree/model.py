@@ -160,8 +160,13 @@ def _check(model: nn.Module, base: Any) -> None:
     model.eval()
     try:
         with torch.no_grad():
-            got = model(**packed_inputs(tree, device), wanted=wanted).log_probs
             plain = [base(input_ids=torch.tensor([s], device=device), use_cache=False).logits[0].float() for s in pair]
+            got = model(**packed_inputs(tree, device), wanted=wanted).log_probs
+    except Exception as raised:  # whatever an architecture raises that lays out its forward in another way
+        raise SpecError(
+            f"packing 'tree' cannot run {type(base).__name__} ({type(raised).__name__}: {raised}); "
+            "set `packing: padded`"
+        ) from raised
     finally:
         model.train(training)
     expected = torch.stack([plain[r][p - 1].log_softmax(-1)[pair[r][p]] for r, p in trained])

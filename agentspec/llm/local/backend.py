@@ -207,6 +207,13 @@ class LocalLLM:
         """
         self._engine.invalidate()
 
+    def give_back(self) -> None:
+        """Drop all that is cached and return its memory to the system: something else needs it now."""
+        from agentspec.llm.local.release import release
+
+        self.invalidate()
+        release()
+
     def record_states(self, layer: Any) -> StateRecorder:
         """From now on, what goes into a decoder `layer` of the model is recorded."""
         from agentspec.llm.local.states import StateRecorder

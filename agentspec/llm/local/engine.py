@@ -21,7 +21,6 @@ from agentspec.llm.local.adapters import active_adapter
 from agentspec.llm.local.cache import PrefixCache
 from agentspec.llm.local.forward import PackedModel, Segment
 from agentspec.llm.local.invariance import version
-from agentspec.llm.local.release import release
 from agentspec.llm.local.rows import ChoiceRow, FreeRow, Job, Row, ScoreRow
 from agentspec.llm.local.sampling import choose, sample
 from agentspec.llm.local.scheduler import Scheduler, schedule
@@ -173,10 +172,9 @@ class Engine:
         del row.slot  # its job may take longer
 
     def invalidate(self) -> None:
-        """Forget keys, values and packed weights, and give back their memory."""
+        """Forget keys, values and packed weights: the weights changed."""
         self.cache.clear()
         self.model.invalidate()
-        release()
 
     def _forget_old_weights(self) -> None:
         """Drop the cache when the weights of the model or of any adapter were written to since the last call."""
