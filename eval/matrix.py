@@ -9,7 +9,6 @@ was and a larger one plays only what is new. One model is in memory at a time an
 from __future__ import annotations
 
 import asyncio
-import gc
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +18,7 @@ from typing import Any
 from agentspec.actions import suggest
 from agentspec.episode import MakeEnv, make_env
 from agentspec.files import json_line, write_lines
+from agentspec.llm.local.release import release
 from agentspec.policies import Policy
 from agentspec.progress import load_policy
 from agentspec.registry import SpecError
@@ -178,7 +178,7 @@ def _play_policy(
             llm = (make_llm or load_policy)(policy)
             asyncio.run(each(LocalPlayer(llm, settings, make_env), settings.concurrency))
             del llm
-            gc.collect()  # the next model needs the memory now, not when the collector gets to the cycles
+            release()  # the next model needs the memory now, not when the collector gets to the cycles
     except Exception as error:
         return [(cell, _reason(error)) for cell in cells]
     return problems
