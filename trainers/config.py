@@ -163,7 +163,7 @@ class ScaffoldConfig(GRPOConfig):
             setattr(self, CHECKPOINTING, self.gradient_checkpointing)  # the same setting under its newer name
         try:
             super().__post_init__()
-        except (TypeError, AttributeError, ImportError) as error:  # of a mapping that TRL hands on: `deepspeed`, say
+        except (TypeError, AttributeError, ImportError) as error:  # of a mapping that TRL passes on: `deepspeed`, say
             raise SpecError(f"configuration: {error}") from error
 
     @property

@@ -14,7 +14,7 @@ from agentspec.actions import suggest
 from agentspec.registry import SpecError
 
 if TYPE_CHECKING:
-    from torch import Tensor  # only tensors handed in are touched: the audit reads this table without it
+    from torch import Tensor  # only the tensors it is given are touched: the audit reads this table without it
 
 Objective = Callable[..., "Tensor"]
 """`(logps, old, advantages, *, low, high)` -> loss per token; (B, T) each, advantages (B, 1) or (B, T)."""

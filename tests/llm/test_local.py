@@ -306,6 +306,16 @@ def test_changed_weights_drop_the_cache():
     assert ask(llm, max_tokens=4).usage.cached_tokens == 0
 
 
+def test_what_is_cached_is_given_back():
+    llm = tiny()
+    first = ask(llm, max_tokens=4)
+    assert len(llm._engine.cache) == 1
+    llm.give_back()
+    assert len(llm._engine.cache) == 0 and not llm._engine.model._modules._packed
+    again = ask(llm, max_tokens=4)
+    assert again.usage.cached_tokens == 0 and again.completions == first.completions
+
+
 def test_a_model_under_training_is_left_as_it_was():
     from peft import LoraConfig, get_peft_model
 

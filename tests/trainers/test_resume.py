@@ -279,3 +279,18 @@ def test_a_checkpoint_is_complete_last(tmp_path: Path, monkeypatch: pytest.Monke
         run.train()
     assert sorted(p.name for p in tmp_path.glob("checkpoint-*")) == ["checkpoint-2", "checkpoint-3"]
     assert last_complete_checkpoint(tmp_path) == tmp_path / "checkpoint-2"
+
+
+def test_after_a_round_the_backend_holds_nothing(tmp_path: Path) -> None:
+    """The update needs the memory, and what was read with the old weights is of no use after it."""
+    run = trainer(tmp_path)
+    held: list[int] = []
+    compute = run._compute_loss
+
+    def noting(*args: Any, **kwargs: Any) -> Any:
+        held.append(len(run.llm._engine.cache))
+        return compute(*args, **kwargs)
+
+    run._compute_loss = noting
+    run.train()
+    assert held and not any(held)
